@@ -1,0 +1,1 @@
+"""Geometry: poses, cameras, rigs, rays, planes, polygons, curves."""

@@ -1,0 +1,226 @@
+"""Natural cubic splines on uniform knots t = 0 .. C - 1, in two forms (IV-D).
+
+*Control points* are what the curve passes through at its knots (the paper's representation, and a
+map's). *Coefficients* are those of the same curve in cubic B-splines: each point of the curve
+depends on four of them only, which keeps a bundle adjustment sparse. `to_coefficients` and
+`from_coefficients` change between the two; both have C rows, because the natural ends (no
+curvature) fold the two outer coefficients into their neighbours, `c_-1 = 2 c_0 - c_1`.
+
+Functions ending in `_flat` take many splines at once, their rows packed one spline after the other,
+`count[i]` rows for spline i. Beyond its ends a spline goes on as a straight line.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+_SOLVE_STEPS = 6
+"""Of cyclic reduction: influence decays by 0.27 a knot, 2^6 knots away it is below rounding."""
+
+
+def starts(count: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
+    """First row of each of n packed splines."""
+    return count.cumsum(0) - count
+
+
+def rows(count: Int[Tensor, " n"]) -> tuple[Int[Tensor, " c"], Int[Tensor, " c"]]:
+    """Spline and rank within it of each packed row."""
+    spline = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
+    return spline, torch.arange(len(spline), device=count.device) - starts(count)[spline]
+
+
+def window(
+    t: Float[Tensor, "*batch"], count: Int[Tensor, "*batch"] | int
+) -> tuple[Int[Tensor, "*batch"], Float[Tensor, "*batch 4"], Float[Tensor, "*batch 4"]]:
+    """Start, weights and their derivatives by t of the four coefficients that make up a point.
+
+    The curve is the sum over k of `weight_k coefficient[start + k]`.
+    `count` is the number of coefficients. With fewer than four the start is 0 and the slots past
+    the last coefficient have weight 0 (do not read there: `window_flat` gives indices that are
+    safe).
+    """
+    start, weight, first, _ = window_with_curvature(t, count)
+    return start, weight, first
+
+
+def window_with_curvature(
+    t: Float[Tensor, "*batch"], count: Int[Tensor, "*batch"] | int
+) -> tuple[
+    Int[Tensor, "*batch"],
+    Float[Tensor, "*batch 4"],
+    Float[Tensor, "*batch 4"],
+    Float[Tensor, "*batch 4"],
+]:
+    """As `window`, with the second derivatives of the weights too."""
+    last = torch.as_tensor(count, device=t.device) - 1
+    inside = torch.minimum(t.clamp_min(0), last.to(t))
+    span = torch.minimum(inside.detach().floor().long(), last - 1).clamp_min(0)
+    u = inside - span
+    over = t - inside
+    v = 1 - u
+    b = torch.stack((v**3, 4 - 3 * u**2 * (2 - u), 4 - 3 * v**2 * (2 - v), u**3), dim=-1) / 6
+    d = torch.stack((-(v**2), u * (3 * u - 4), v * (4 - 3 * v), u**2), dim=-1) / 2
+    dd = torch.stack((v, 3 * u - 2, 3 * v - 2, u), dim=-1)
+
+    # The coefficient each weight belongs to; those of a ghost -1 or C go to its neighbour twice
+    # and, negative, to the next.
+    slot = torch.arange(4, device=t.device)
+    coefficient = span[..., None] - 1 + slot
+    last = last.expand(t.shape)[..., None]
+    ghost = (coefficient < 0) | (coefficient > last)
+    near = torch.minimum(coefficient.clamp_min(0), last)
+    next_to_ghost = torch.where(coefficient < 0, torch.ones_like(near), (last - 1).expand_as(near))
+    far = torch.where(ghost, next_to_ghost, near)
+    start = torch.minimum(span - 1, last[..., 0] - 3).clamp_min(0)
+    near_share = torch.where(ghost, 2.0, 1.0).to(t)
+    far_share = torch.where(ghost, -1.0, 0.0).to(t)
+    # fold[k, j]: how much of weight k goes to slot j
+    fold = near_share[..., None] * (near[..., None] == start[..., None, None] + slot)
+    fold = fold + far_share[..., None] * (far[..., None] == start[..., None, None] + slot)
+    b, d, dd = ((part[..., None] * fold).sum(-2) for part in (b, d, dd))
+    # Straight on beyond the ends.
+    outside = (over != 0)[..., None]
+    return start, b + over[..., None] * d, d, torch.where(outside, 0.0, dd)
+
+
+def window_flat(
+    t: Float[Tensor, " m"],
+    start_of_spline: Int[Tensor, " m"],
+    count_of_spline: Int[Tensor, " m"],
+) -> tuple[Int[Tensor, "m 4"], Float[Tensor, "m 4"], Float[Tensor, "m 4"]]:
+    """Rows of packed coefficients, weights and their derivatives by t, for points on many splines.
+
+    The rows always belong to the point's own spline; those that pad a spline of two or three
+    coefficients have weight 0.
+    """
+    start, weight, d_weight = window(t, count_of_spline)
+    slot = torch.arange(4, device=t.device)
+    rank = torch.minimum(start[:, None] + slot, count_of_spline[:, None] - 1)
+    return start_of_spline[:, None] + rank, weight, d_weight
+
+
+def to_coefficients_flat(
+    control: Float[Tensor, "c k"], count: Int[Tensor, " n"]
+) -> Float[Tensor, "c k"]:
+    """B-spline coefficients of packed splines that pass through `control`.
+
+    The equations `c_(i-1) + 4 c_i + c_(i+1) = 6 p_i` are solved by parallel cyclic reduction: every
+    row eliminates its neighbours 1, 2, 4, ... away at once. Rows of different splines never mix, as
+    the first and last row of each have no neighbours.
+    """
+    _, rank = rows(count)
+    spline_count = torch.repeat_interleave(count, count)
+    interior = ((rank > 0) & (rank < spline_count - 1))[:, None]
+    lower = torch.where(interior, 0.25, 0.0).to(control)
+    upper = lower
+    rhs = torch.where(interior, 1.5, 1.0).to(control) * control
+    for step in (2**power for power in range(_SOLVE_STEPS)):
+        # Rows are scaled to a unit diagonal throughout.
+        before = tuple(_shifted(column, step) for column in (lower, upper, rhs))
+        after = tuple(_shifted(column, -step) for column in (lower, upper, rhs))
+        scale = 1 / (1 - lower * before[1] - upper * after[0])
+        rhs = scale * (rhs - lower * before[2] - upper * after[2])
+        lower, upper = -scale * lower * before[0], -scale * upper * after[1]
+    return rhs
+
+
+def from_coefficients_flat(
+    coefficient: Float[Tensor, "c k"], count: Int[Tensor, " n"]
+) -> Float[Tensor, "c k"]:
+    """Points at the knots of packed splines, the inverse of `to_coefficients_flat`."""
+    _, rank = rows(count)
+    spline_count = torch.repeat_interleave(count, count)
+    interior = ((rank > 0) & (rank < spline_count - 1))[:, None]
+    neighbours = _shifted(coefficient, 1) + _shifted(coefficient, -1)
+    return torch.where(interior, (neighbours + 4 * coefficient) / 6, coefficient)
+
+
+def to_coefficients(control: Float[Tensor, "*batch C k"]) -> Float[Tensor, "*batch C k"]:
+    """B-spline coefficients of splines that pass through `control`."""
+    return to_coefficients_flat(control.flatten(0, -2), _equal_counts(control)).reshape(
+        control.shape
+    )
+
+
+def from_coefficients(coefficient: Float[Tensor, "*batch C k"]) -> Float[Tensor, "*batch C k"]:
+    """Points at the knots, the inverse of `to_coefficients`."""
+    flat = from_coefficients_flat(coefficient.flatten(0, -2), _equal_counts(coefficient))
+    return flat.reshape(coefficient.shape)
+
+
+def basis(t: Float[Tensor, " m"], count: int) -> Float[Tensor, "m C"]:
+    """The matrix that takes `count` control points to the points of the curve at parameters t."""
+    identity = torch.eye(count, dtype=t.dtype, device=t.device)
+    return _combine(to_coefficients(identity), *window(t, count)[:2])
+
+
+def evaluate(
+    control: Float[Tensor, "*#batch C k"], t: Float[Tensor, "*#batch m"]
+) -> Float[Tensor, "*#batch m k"]:
+    """Points of the curves at parameters t."""
+    start, weight, _ = window(t, control.shape[-2])
+    return _combine(to_coefficients(control), start, weight)
+
+
+def derivative(
+    control: Float[Tensor, "*#batch C k"], t: Float[Tensor, "*#batch m"]
+) -> Float[Tensor, "*#batch m k"]:
+    """Derivatives of the curves by the parameter (per knot, not per metre)."""
+    start, _, d_weight = window(t, control.shape[-2])
+    return _combine(to_coefficients(control), start, d_weight)
+
+
+def evaluate_flat(
+    control: Float[Tensor, "c k"],
+    count: Int[Tensor, " n"],
+    t: Float[Tensor, " m"],
+    spline: Int[Tensor, " m"],
+) -> Float[Tensor, "m k"]:
+    """Points at parameters t of packed splines; `spline` says which one each point is on."""
+    return _flat(control, count, t, spline, 1)
+
+
+def derivative_flat(
+    control: Float[Tensor, "c k"],
+    count: Int[Tensor, " n"],
+    t: Float[Tensor, " m"],
+    spline: Int[Tensor, " m"],
+) -> Float[Tensor, "m k"]:
+    """Derivatives by t of packed splines; `spline` says which one each point is on."""
+    return _flat(control, count, t, spline, 2)
+
+
+def _flat(control: Tensor, count: Tensor, t: Tensor, spline: Tensor, part: int) -> Tensor:
+    windows = window_flat(t, starts(count)[spline], count[spline])
+    coefficient = to_coefficients_flat(control, count)
+    return (windows[part][..., None] * coefficient[windows[0]]).sum(-2)
+
+
+def _combine(coefficient: Tensor, start: Tensor, weight: Tensor) -> Tensor:
+    """Weighted sums of four rows of `[*batch, C, k]` for `[*batch, m]` starts."""
+    slot = torch.arange(4, device=start.device)
+    index = (start[..., None] + slot).clamp_max(coefficient.shape[-2] - 1)
+    batch = torch.broadcast_shapes(coefficient.shape[:-2], start.shape[:-1])
+    coefficient = coefficient.expand(*batch, *coefficient.shape[-2:])
+    index, weight = (part.expand(*batch, *part.shape[-2:]) for part in (index, weight))
+    flat = index.flatten(-2)[..., None].expand(*batch, -1, coefficient.shape[-1])
+    taken = coefficient.gather(-2, flat).unflatten(-2, index.shape[-2:])
+    return (weight[..., None] * taken).sum(-2)
+
+
+def _equal_counts(control: Tensor) -> Tensor:
+    number = math.prod(control.shape[:-2])
+    return torch.full((number,), control.shape[-2], device=control.device)
+
+
+def _shifted(column: Tensor, step: int) -> Tensor:
+    """Row i of the result is row `i - step`, zero where there is none."""
+    size = min(abs(step), len(column))
+    zero = torch.zeros_like(column[:size])
+    if step > 0:
+        return torch.cat((zero, column[: len(column) - size]))
+    return torch.cat((column[size:], zero))
