@@ -1,0 +1,1 @@
+"""Batched nonlinear least squares over typed variables."""

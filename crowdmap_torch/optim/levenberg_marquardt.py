@@ -1,0 +1,183 @@
+"""Levenberg-Marquardt with gain-ratio damping, for one problem or a batch of independent ones.
+
+`init` weighs the first values, `step` takes one step and returns the next state, `solve` is the same step in a
+loop. Every independent problem has its own damping, and each accepts or rejects its own step. After a rejected step the
+linearisation is kept. A failure is a reason in the state, never an exception.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.optim.linear import Backend, DenseBackend, NormalEquations
+from crowdmap_torch.optim.linearize import term_costs
+from crowdmap_torch.optim.problem import Problem, Values, retract
+
+RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
+REASONS = (
+    "still running",
+    "converged: the cost no longer falls",
+    "converged: the step is below its tolerance",
+    "stalled: no damping up to the largest gives a lower cost",
+    "failed: the cost is not finite at the start",
+)
+"""What a reason code of `LmState.reason` means."""
+
+
+@dataclass(frozen=True)
+class LmConfig:
+    """When to stop, and how the damping moves (Madsen, Nielsen and Tingleff 2004, section 3.2)."""
+
+    max_iterations: int = 50
+    """Most steps, rejected ones counted."""
+    cost_tolerance: float = 1e-6
+    """Stop when an accepted step lowers the cost by less than this share of it."""
+    step_tolerance: float = 1e-10
+    """Stop when the step's norm, in tangent units, is below this."""
+    initial_damping: float = 1e-4
+    """First damping, relative to the Hessian's diagonal."""
+    max_damping: float = 1e12
+    """A problem whose damping passes this has stalled."""
+    min_damping: float = 1e-12
+    """The damping never falls below this."""
+
+
+@dataclass(frozen=True)
+class LmState:
+    """Where the minimisation stands; every tensor has one entry per independent problem."""
+
+    values: Values
+    damping: Float[Tensor, " groups"]
+    growth: Float[Tensor, " groups"]
+    """Factor by which the next rejection raises the damping."""
+    cost: Float[Tensor, " groups"]
+    term_cost: Mapping[str, Float[Tensor, " groups"]]
+    gain_ratio: Float[Tensor, " groups"]
+    """Decrease of the cost over the decrease that the model predicted, of the last step."""
+    step_norm: Float[Tensor, " groups"]
+    accepted: Bool[Tensor, " groups"]
+    """Whether the last step was taken."""
+    reason: Int[Tensor, " groups"]
+    """Index into `REASONS`."""
+    normal: NormalEquations | None = field(default=None, repr=False)
+    """Normal equations at the values; None where they moved since, or the problem changed."""
+    iterations: int = 0
+    linearizations: int = 0
+
+    @property
+    def done(self) -> bool:
+        """True when no problem is running any more."""
+        return bool((self.reason != RUNNING).all())
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """The reason of every problem in words."""
+        return tuple(REASONS[code] for code in self.reason.tolist())
+
+
+def init(problem: Problem, values: Values, config: LmConfig) -> LmState:
+    """The state before the first step: the cost at `values`, nothing moved."""
+    term_cost = term_costs(problem, values)
+    cost = torch.stack(list(term_cost.values())).sum(0)
+    nothing = torch.zeros_like(cost)
+    return LmState(
+        values=values,
+        damping=torch.full_like(nothing, config.initial_damping),
+        growth=torch.full_like(nothing, 2.0),
+        cost=cost,
+        term_cost=term_cost,
+        gain_ratio=nothing,
+        step_norm=nothing,
+        accepted=torch.zeros_like(cost, dtype=torch.bool),
+        reason=torch.where(cost.isfinite(), RUNNING, NOT_FINITE),
+    )
+
+
+def step(
+    problem: Problem, state: LmState, config: LmConfig, *, backend: Backend | None = None
+) -> LmState:
+    """The state after one step: each problem that is still running moves, or raises its damping."""
+    normal = state.normal
+    if normal is None:
+        normal = (backend or DenseBackend()).assemble(problem, state.values)
+        state = replace(state, linearizations=state.linearizations + 1)
+    running = state.reason == RUNNING
+    proposal = normal.solve(state.damping)
+    candidate = retract(problem, state.values, proposal.delta)
+    term_cost = term_costs(problem, candidate)
+    cost = torch.stack(list(term_cost.values())).sum(0)
+    decrease = normal.cost - cost
+    gain = decrease / proposal.predicted.clamp_min(torch.finfo(cost.dtype).tiny)
+    accepted = running & proposal.solved & cost.isfinite() & (decrease > 0)
+
+    shrink = (1 - (2 * gain - 1) ** 3).clamp(1 / 3, 2.0)
+    damping = torch.where(accepted, state.damping * shrink, state.damping * state.growth)
+    damping = torch.where(running, damping, state.damping).clamp_min(config.min_damping)
+    growth = torch.where(accepted, torch.full_like(cost, 2.0), state.growth * 2)
+
+    reason = state.reason.clone()
+    tolerance = config.cost_tolerance * normal.cost
+    # Where the model itself promises next to nothing, a rejection is rounding and not a bad step.
+    nothing_left = proposal.solved & ~accepted & (proposal.predicted <= 1e-3 * tolerance)
+    reason[running & ((accepted & (decrease <= tolerance)) | nothing_left)] = CONVERGED_COST
+    tiny = proposal.solved & (proposal.norm < config.step_tolerance)
+    reason[running & tiny & (reason == RUNNING)] = CONVERGED_STEP
+    reason[running & ~accepted & (damping > config.max_damping) & (reason == RUNNING)] = STALLED
+
+    moved = bool(accepted.any())
+    return replace(
+        state,
+        values=_merge(problem, state.values, candidate, accepted) if moved else state.values,
+        damping=damping,
+        growth=growth,
+        cost=torch.where(accepted, cost, normal.cost),
+        term_cost={
+            name: torch.where(accepted, new, normal.term_cost[name])
+            for name, new in term_cost.items()
+        },
+        gain_ratio=torch.where(running, gain, state.gain_ratio),
+        step_norm=torch.where(running, proposal.norm, state.step_norm),
+        accepted=accepted,
+        reason=reason,
+        # After a rejected step the linearisation still holds.
+        normal=None if moved else normal,
+        iterations=state.iterations + 1,
+    )
+
+
+def changed(state: LmState) -> LmState:
+    """The state for a problem that changed (matches refreshed, scales narrowed): linearised anew, running again."""
+    reason = torch.where(state.reason == NOT_FINITE, state.reason, RUNNING)
+    return replace(state, normal=None, reason=reason)
+
+
+def solve(
+    problem: Problem, values: Values, config: LmConfig, *, backend: Backend | None = None
+) -> LmState:
+    """The state at the end: every problem converged, stalled, or out of iterations."""
+    state = init(problem, values, config)
+    while not state.done and state.iterations < config.max_iterations:
+        state = step(problem, state, config, backend=backend)
+    return state
+
+
+def _merge(
+    problem: Problem, old: Values, new: Values, accepted: Bool[Tensor, " groups"]
+) -> dict[str, Tensor]:
+    """Candidate values where the block's problem accepted its step, the old ones elsewhere."""
+    if bool(accepted.all()):
+        return dict(new)
+    merged = {}
+    for name, variable in problem.variables.items():
+        if variable.group is None:
+            merged[name] = new[name] if bool(accepted[0]) else old[name]
+        else:
+            take = accepted[variable.group]
+            take = take.reshape(-1, *(1,) * (new[name].ndim - 1))
+            merged[name] = torch.where(take, new[name], old[name])
+    return merged

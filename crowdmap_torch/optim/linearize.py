@@ -1,0 +1,111 @@
+"""Residuals, costs and block Jacobians of a cost term, at zero tangent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.func import jacfwd, vmap
+
+from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
+
+CHUNK_ROWS = 1 << 16
+"""Rows that are linearised at once; bounds the memory, whatever the size of the problem."""
+
+
+@dataclass(frozen=True)
+class LinearRows:
+    """Rows of a term, whitened: residuals, one Jacobian per slot, and the robust weights."""
+
+    residual: Float[Tensor, "m d"]
+    jacobians: tuple[Float[Tensor, "m d k"], ...]
+    robust_weight: Float[Tensor, " m"]
+    rho: Float[Tensor, " m"]
+
+
+def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
+    """The same term, restricted to some of its rows."""
+    return replace(
+        term,
+        slots=tuple((name, block[index]) for name, block in term.slots),
+        constants=tuple(constant[index] for constant in term.constants),
+        weight=None if term.weight is None else term.weight[index],
+    )
+
+
+def chunks(term: CostTerm, size: int = CHUNK_ROWS) -> Iterator[tuple[slice, CostTerm]]:
+    """The term in pieces of at most `size` rows."""
+    for start in range(0, len(term), size):
+        piece = slice(start, min(start + size, len(term)))
+        yield piece, rows(term, piece)
+
+
+def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:
+    """Whitened residuals of all rows."""
+    if not len(term):
+        return torch.zeros(0, 1, dtype=next(iter(values.values())).dtype)
+    blocks = [values[name][block] for name, block in term.slots]
+    return _whiten(term, vmap(term.residual)(*blocks, *term.constants))
+
+
+def linearize(term: CostTerm, variables: dict[str, Variable], values: Values) -> LinearRows:
+    """Whitened residuals and Jacobians of all rows at zero tangent, with the loss's weights."""
+    blocks = [values[name][block] for name, block in term.slots]
+    if term.jacobian is not None:
+        residual, jacobians = term.jacobian(*blocks, *term.constants)
+    else:
+        residual, jacobians = autograd_jacobians(term, variables, values)
+    if term.weight is not None:
+        scale = term.weight if term.weight.ndim == 2 else term.weight[:, None]
+        residual = residual * scale
+        jacobians = tuple(J * scale[..., None] for J in jacobians)
+    s = residual.square().sum(-1)
+    return LinearRows(residual, jacobians, term.loss.weight(s), term.loss.rho(s))
+
+
+def autograd_jacobians(
+    term: CostTerm, variables: dict[str, Variable], values: Values
+) -> tuple[Float[Tensor, "m d"], tuple[Float[Tensor, "m d k"], ...]]:
+    """Residuals and Jacobians (not whitened) by forward-mode autograd through every retraction."""
+    blocks = tuple(values[name][block] for name, block in term.slots)
+    kinds = [variables[name] for name, _ in term.slots]
+
+    def moved(tangents, blocks, constants):
+        at = [
+            kind.retract(block[None], xi[None])[0]
+            for kind, block, xi in zip(kinds, blocks, tangents, strict=True)
+        ]
+        residual = term.residual(*at, *constants)
+        return residual, residual
+
+    zero = tuple(blocks[0].new_zeros(len(term), kind.tangent_dim) for kind in kinds)
+    jacobians, residual = vmap(jacfwd(moved, argnums=0, has_aux=True))(zero, blocks, term.constants)
+    return residual, jacobians
+
+
+def term_costs(
+    problem: Problem, values: Values, *, chunk_rows: int = CHUNK_ROWS
+) -> dict[str, Float[Tensor, " groups"]]:
+    """`1/2 sum rho` of every term, for each of the independent problems."""
+    first = next(iter(values.values()))
+    costs = {}
+    for name, term in problem.terms.items():
+        total = first.new_zeros(problem.group_count)
+        for _, piece in chunks(term, chunk_rows):
+            rho = term.loss.rho(residuals(piece, values).square().sum(-1)) / 2
+            group = problem.group_of_rows(piece)
+            if group is None:
+                total[0] += rho.sum()
+            else:
+                total.index_add_(0, group, rho)
+        costs[name] = total
+    return costs
+
+
+def _whiten(term: CostTerm, residual: Float[Tensor, "m d"]) -> Float[Tensor, "m d"]:
+    if term.weight is None:
+        return residual
+    return residual * (term.weight if term.weight.ndim == 2 else term.weight[:, None])

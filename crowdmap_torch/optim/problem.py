@@ -1,0 +1,83 @@
+"""Nonlinear least squares as data: variables on manifolds, cost terms, and the problem they make.
+
+A variable is a stack of blocks (camera poses, sign planes, spline coefficients), each with its own small tangent space. A
+cost term is a stack of rows (observations); each row touches one block per slot. Nothing here knows what a camera is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.optim.robust import Loss, Quadratic
+
+Values = Mapping[str, Tensor]
+"""The value of every block of every variable, by name; blocks are the leading axis."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A stack of unknown blocks of one kind."""
+
+    tangent_dim: int
+    retract: Callable[[Tensor, Tensor], Tensor]
+    """`(values [n, ...], tangents [n, tangent_dim]) -> values`; must be the identity at zero."""
+    group: Int[Tensor, " n"] | None = None
+    """Which of several independent problems each block belongs to; None: there is one problem."""
+
+
+@dataclass(frozen=True)
+class CostTerm:
+    """`1/2 sum_row rho(|weight * residual|^2)`."""
+
+    residual: Callable[..., Tensor]
+    """Residual of ONE row: the value of one block per slot, then one row of each constant, to a vector [d]."""
+    slots: tuple[tuple[str, Int[Tensor, " m"]], ...]
+    """Per slot the variable's name and the block that each row touches."""
+    constants: tuple[Tensor, ...] = ()
+    """Arrays with the rows as their leading axis."""
+    weight: Float[Tensor, " m"] | Float[Tensor, "m d"] | None = None
+    """One over the standard deviation of each row, or of each of its residual's entries; None: one."""
+    loss: Loss = field(default_factory=Quadratic)
+    jacobian: Callable[..., tuple[Tensor, tuple[Tensor, ...]]] | None = None
+    """Batched residuals [m, d] and one Jacobian [m, d, k] per slot, by the chain rule; None: by autograd."""
+
+    def __len__(self) -> int:
+        return len(self.slots[0][1])
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Variables, the terms over them, and how many independent problems they make."""
+
+    variables: Mapping[str, Variable]
+    terms: Mapping[str, CostTerm]
+    group_count: int = 1
+
+    def group_of_rows(self, term: CostTerm) -> Int[Tensor, " m"] | None:
+        """The independent problem of each row; None where there is one problem."""
+        name, block = term.slots[0]
+        group = self.variables[name].group
+        return None if group is None else group[block]
+
+
+def retract(problem: Problem, values: Values, delta: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The values moved by tangents `delta`, variable by variable."""
+    return {
+        name: problem.variables[name].retract(value, delta[name]) if name in delta else value
+        for name, value in values.items()
+    }
+
+
+def euclidean(value: Float[Tensor, "n k"], delta: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """Retraction of a vector space: the sum."""
+    return value + delta
+
+
+def positive(value: Float[Tensor, "n k"], delta: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """Retraction of positive numbers: tangents are relative changes, and no step leaves the set."""
+    return value * torch.exp(delta)

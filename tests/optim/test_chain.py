@@ -1,0 +1,209 @@
+"""Elimination along chains against the dense solve, on problems small enough for both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.chain import ChainBackend
+from crowdmap_torch.optim.linear import DenseBackend
+from crowdmap_torch.optim.linearize import rows
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
+from crowdmap_torch.optim.robust import Tukey
+
+
+def difference(x, y):
+    return y - x
+
+
+def prior(x, mean):
+    return x - mean
+
+
+def sighting(pose, landmark, measured):
+    """A bearing-like, nonlinear sighting of a landmark from a pose."""
+    offset = landmark - pose[:2]
+    return torch.stack((torch.atan2(offset[1], offset[0]), offset.norm())) + pose[2] - measured
+
+
+def pair_sighting(pose, first, second, measured):
+    return (0.3 * first + 0.7 * second - pose[:2]) - measured
+
+
+def problem(chain_lengths, landmarks=9, seed=0):
+    """Chains of 2D poses with a common offset that see landmarks near them, as a Problem and start values."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(*shape, scale=1.0):
+        return scale * torch.randn(*shape, dtype=torch.float64, generator=generator)
+
+    chain = torch.repeat_interleave(torch.arange(len(chain_lengths)), torch.tensor(chain_lengths))
+    n = len(chain)
+    step = torch.cat([torch.arange(length) for length in chain_lengths]).double()
+    poses = torch.stack((step, 0.1 * noise(n), 0.1 * noise(n)), dim=-1)
+    marks = torch.stack(
+        (torch.linspace(0, max(chain_lengths), landmarks).double(), 3 + noise(landmarks)), dim=-1
+    )
+    distance = (poses[:, None, 0] - marks[None, :, 0]).abs()
+    pose, mark = torch.nonzero(distance < 6, as_tuple=True)
+    measured = torch.stack(
+        [
+            sighting(poses[p], marks[m], torch.zeros(2).double())
+            for p, m in zip(pose, mark, strict=True)
+        ]
+    ) + noise(len(pose), 2, scale=0.01)
+    measured[::17] += 2.0
+    follows = torch.nonzero(chain[1:] == chain[:-1])[:, 0]
+    second = (mark + 1) % landmarks
+    pair = 0.3 * marks[mark] + 0.7 * marks[second] - poses[pose][:, :2]
+    terms = {
+        "prior": CostTerm(
+            prior,
+            (("pose", torch.arange(n)),),
+            (poses + noise(n, 3, scale=0.1),),
+            torch.full((n,), 2.0).double(),
+        ),
+        "odometry": CostTerm(
+            difference,
+            (("pose", follows + 1), ("pose", follows)),
+            (),
+            torch.full((len(follows),), 3.0).double(),
+        ),
+        "sighting": CostTerm(
+            sighting,
+            (("pose", pose), ("mark", mark)),
+            (measured,),
+            torch.full((len(pose),), 30.0).double(),
+            Tukey(20.0),
+        ),
+        "pair": CostTerm(
+            pair_sighting, (("pose", pose), ("mark", mark), ("mark", second)), (pair,), None
+        ),
+        "mark_prior": CostTerm(prior, (("mark", torch.arange(landmarks)),), (marks,), None),
+    }
+    variables = {"pose": Variable(3, euclidean), "mark": Variable(2, euclidean)}
+    values = {
+        "pose": poses + noise(n, 3, scale=0.1),
+        "mark": marks + noise(landmarks, 2, scale=0.2),
+    }
+    return Problem(variables, terms), values, chain
+
+
+@pytest.mark.parametrize("lengths", [[1], [9], [10, 1, 9, 8], [85, 40], [19, 2, 33]])
+@pytest.mark.parametrize(("tile_size", "group_tiles"), [(8, 32), (1, 1), (3, 2)])
+def test_elimination_gives_the_dense_step(lengths, tile_size, group_tiles):
+    built, values, chain = problem(lengths)
+    backend = ChainBackend("pose", chain, tile_size=tile_size, group_tiles=group_tiles)
+    chained, dense = (b.assemble(built, values) for b in (backend, DenseBackend()))
+    torch.testing.assert_close(chained.cost, dense.cost)
+    for damping in (1e-6, 1e-1, 1e3):
+        damping = torch.tensor([damping], dtype=torch.float64)
+        ours, theirs = chained.solve(damping), dense.solve(damping)
+        for name in values:
+            torch.testing.assert_close(ours.delta[name], theirs.delta[name], rtol=1e-8, atol=1e-10)
+        torch.testing.assert_close(ours.predicted, theirs.predicted)
+        torch.testing.assert_close(ours.norm, theirs.norm)
+
+
+@pytest.mark.parametrize("lengths", [[1], [10, 1, 9], [85, 40]])
+def test_leaves_and_chain_give_the_dense_step(lengths):
+    built, values, chain = problem(lengths)
+    n = len(chain)
+    every = torch.arange(n)
+    bound = CostTerm(
+        difference, (("pose", every), ("drift", every)), (), torch.full((n,), 9.0).double()
+    )
+    terms = {
+        name: replace(
+            term, slots=tuple(("drift" if name == "odometry" else s, i) for s, i in term.slots)
+        )
+        for name, term in built.terms.items()
+    }
+    variables = {**built.variables, "drift": Variable(3, euclidean)}
+    problem_with_leaves = Problem(variables, {**terms, "bound": bound})
+    values = {**values, "drift": values["pose"] + 0.1}
+    backend = ChainBackend("drift", chain, leaves="pose", carrier=every, tile_size=4, group_tiles=7)
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    ours = backend.assemble(problem_with_leaves, values).solve(damping)
+    dense = DenseBackend().assemble(problem_with_leaves, values)
+    theirs = dense.solve(damping)
+    for name in values:
+        torch.testing.assert_close(ours.delta[name], theirs.delta[name], rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(ours.predicted, theirs.predicted)
+
+
+def test_a_block_of_the_chain_may_carry_several_leaves():
+    built, values, chain = problem([30, 21], seed=4)
+    n = len(chain)
+    # One drift for every three poses of a chain.
+    first = torch.cat((torch.tensor([True]), chain[1:] != chain[:-1]))
+    rank = torch.arange(n) - torch.arange(n)[first][first.cumsum(0) - 1]
+    begins = first | (rank % 3 == 0)
+    carrier = begins.cumsum(0) - 1
+    drift_chain = chain[begins]
+    link = torch.nonzero(drift_chain[1:] == drift_chain[:-1])[:, 0]
+    bound = CostTerm(
+        difference, (("pose", torch.arange(n)), ("drift", carrier)), (), torch.full((n,), 9.0).double()
+    )
+    terms = {
+        **{name: term for name, term in built.terms.items() if name != "odometry"},
+        "drift": CostTerm(difference, (("drift", link), ("drift", link + 1))),
+        "bound": bound,
+    }
+    carried = Problem({**built.variables, "drift": Variable(3, euclidean)}, terms)
+    values = {**values, "drift": values["pose"][begins] + 0.1}
+    backend = ChainBackend("drift", drift_chain, leaves="pose", carrier=carrier, tile_size=3)
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    ours = backend.assemble(carried, values).solve(damping)
+    theirs = DenseBackend().assemble(carried, values).solve(damping)
+    for name in values:
+        torch.testing.assert_close(ours.delta[name], theirs.delta[name], rtol=1e-8, atol=1e-10)
+
+
+def test_marginal_covariance_is_the_block_of_the_dense_inverse():
+    built, values, chain = problem([40, 25], seed=3)
+    marginal = ChainBackend("pose", chain).assemble(built, values).marginal_covariance(floor=0.0)
+    dense = DenseBackend().assemble(built, values)
+    n = 3 * len(chain)
+    torch.testing.assert_close(
+        marginal, torch.linalg.inv(dense.hessian[0])[n:, n:], rtol=1e-7, atol=1e-12
+    )
+
+
+def test_both_back_ends_reach_the_same_minimum():
+    built, values, chain = problem([30, 20], seed=1)
+    config = lm.LmConfig(cost_tolerance=1e-12)
+    ours = lm.solve(built, values, config, backend=ChainBackend("pose", chain))
+    theirs = lm.solve(built, values, config)
+    assert ours.done
+    torch.testing.assert_close(ours.cost, theirs.cost, rtol=1e-9, atol=0)
+    torch.testing.assert_close(ours.values["mark"], theirs.values["mark"], rtol=0, atol=1e-6)
+
+
+def test_the_step_does_not_depend_on_the_order_of_rows():
+    built, values, chain = problem([30, 20], seed=2)
+    generator = torch.Generator().manual_seed(0)
+    shuffled = {}
+    for name, term in built.terms.items():
+        shuffled[name] = rows(term, torch.randperm(len(term), generator=generator))
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    first = ChainBackend("pose", chain).assemble(built, values).solve(damping)
+    second = (
+        ChainBackend("pose", chain)
+        .assemble(Problem(built.variables, shuffled), values)
+        .solve(damping)
+    )
+    for name in values:
+        torch.testing.assert_close(first.delta[name], second.delta[name], rtol=1e-9, atol=1e-11)
+
+
+def test_links_between_distant_blocks_are_refused():
+    built, values, chain = problem([12])
+    far = CostTerm(difference, (("pose", torch.tensor([0])), ("pose", torch.tensor([5]))))
+    with pytest.raises(ValueError, match="neither neighbours"):
+        ChainBackend("pose", chain).assemble(
+            Problem(built.variables, {**built.terms, "far": far}), values
+        )
