@@ -1,0 +1,1 @@
+"""Reading and writing datasets, maps and run folders (FORMAT.md)."""

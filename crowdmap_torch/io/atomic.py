@@ -1,0 +1,62 @@
+"""Files and folders that are complete or not there: written beside their place, then renamed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """A path to write to; it becomes `path` if the block ends well and disappears if not."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = _beside(path, "part")
+    try:
+        yield beside
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """An empty folder to write to; it becomes `path` if the block ends well and disappears if not.
+
+    What was at `path` before stays untouched until the block has ended, and is put back should the
+    renaming fail.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = _beside(path, "part")
+    beside.mkdir()
+    try:
+        yield beside
+        _replace_folder(beside, path)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def _replace_folder(new: Path, path: Path) -> None:
+    if not os.path.lexists(path):
+        new.rename(path)
+        return
+    # A folder cannot be renamed over another that has files in it: the old one steps aside first.
+    old = _beside(path, "old")
+    path.rename(old)
+    try:
+        new.rename(path)
+    except OSError:
+        old.rename(path)
+        raise
+    if old.is_dir() and not old.is_symlink():
+        shutil.rmtree(old)
+    else:
+        old.unlink()
+
+
+def _beside(path: Path, ending: str) -> Path:
+    """A name in the same folder, and so on the same file system, that nobody else uses."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.{ending}")

@@ -1,0 +1,277 @@
+"""Columns of a Parquet file, checked as they are taken: types, nulls, NaN.
+
+Complaints name the file, the row and the column.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Bool, Float, Int
+
+from crowdmap_torch.io.errors import InputError, one_line
+
+
+@dataclass(frozen=True)
+class Lists:
+    """A column of lists, one after the other."""
+
+    values: Float[np.ndarray, " p *point"]
+    count: Int[np.ndarray, " n"]
+    """How many values each row has."""
+
+    @property
+    def start(self) -> Int[np.ndarray, " n"]:
+        """Where each row begins in `values`."""
+        return np.cumsum(self.count) - self.count
+
+    @property
+    def row(self) -> Int[np.ndarray, " p"]:
+        """The row each value belongs to."""
+        return np.repeat(np.arange(len(self.count)), self.count)
+
+
+class Sheet:
+    """A Parquet file; only the columns asked for are read, others may be there."""
+
+    def __init__(self, path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> None:
+        self.path = path
+        self._table = _read(path, required, optional)
+
+    def __len__(self) -> int:
+        return self._table.num_rows
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._table.column_names
+
+    def fault(self, rule: str, row: int | None = None) -> InputError:
+        """The error that says in which row of which file a rule is broken."""
+        return InputError(f"{self.path}: {'' if row is None else f'row {row}: '}{rule}")
+
+    def refuse(self, is_bad: Bool[np.ndarray, " n"], rule: Callable[[int], str]) -> None:
+        """Raises for the first bad row; `rule` words what is wrong with a row."""
+        if is_bad.any():
+            row = int(is_bad.argmax())
+            raise self.fault(rule(row), row)
+
+    def integers(self, name: str, *, null: int | None = None) -> Int[np.ndarray, " n"]:
+        """Whole numbers; where `null` is given, a null or missing column holds it instead."""
+        column = self._column(
+            name, lambda t: t in (pa.int32(), pa.int64()), "int64", nullable=null is not None
+        )
+        if column is None:
+            return np.full(len(self), null, dtype=np.int64)
+        values = column.cast(pa.int64())
+        # A copy: arrow's own memory is read-only.
+        return np.array((values if null is None else values.fill_null(null)).to_numpy())
+
+    def numbers(
+        self, name: str, *, optional: bool = False, single: bool = False
+    ) -> Float[np.ndarray, " n"]:
+        """Finite numbers, NaN for unknown where `optional`. `single`: float32 will do."""
+        allowed = (pa.float64(), pa.float32()) if single else (pa.float64(),)
+        expected = "float" if single else "float64"
+        column = self._column(name, lambda t: t in allowed, expected, nullable=optional)
+        if column is None:
+            return np.full(len(self), np.nan)
+        values = column.cast(pa.float64())
+        known = values.is_valid().to_numpy(zero_copy_only=False)
+        numbers = np.array(values.fill_null(np.nan).to_numpy())
+        self.refuse(
+            known & ~np.isfinite(numbers),
+            lambda row: f"column {name!r}: expected a finite number, found {numbers[row]}",
+        )
+        return numbers
+
+    def strings(self, name: str, *, optional: bool = False) -> pa.StringArray:
+        """Texts; where `optional`, nulls stand for unknown, and so does a missing column."""
+        column = self._column(name, _is_text, "string", nullable=optional)
+        if column is None:
+            return pa.nulls(len(self), pa.string())
+        texts = column.cast(pa.string())
+        try:
+            texts.validate(full=True)
+        except pa.ArrowInvalid as error:
+            raise self.fault(f"column {name!r}: expected UTF-8 ({one_line(error)})") from error
+        return texts
+
+    def codes(
+        self, name: str, names: Sequence[str], *, optional: bool = False
+    ) -> Int[np.ndarray, " n"]:
+        """The place of each text in `names`, -1 for null; a text that is not there is refused."""
+        texts = self.strings(name, optional=optional)
+        place = {known: code for code, known in enumerate(names)}
+        encoded = texts.dictionary_encode()
+        # The last entry is for null, whose index below is -1.
+        found = [*(place.get(text, -2) for text in encoded.dictionary.to_pylist()), -1]
+        codes = np.array(found)[encoded.indices.fill_null(-1).to_numpy()]
+        self.refuse(
+            codes == -2,
+            lambda row: (
+                f"column {name!r}: {texts[row].as_py()!r} is unknown; expected one of "
+                + ", ".join(names)
+            ),
+        )
+        return codes
+
+    def ids(self, name: str) -> tuple[str, ...]:
+        """Texts none of which is empty or stands in two rows."""
+        names = self.strings(name).to_pylist()
+        if "" in names:
+            raise self.fault(f"column {name!r}: expected a name, found ''", names.index(""))
+        if len(set(names)) < len(names):
+            first: dict[str, int] = {}
+            row = next(k for k, text in enumerate(names) if first.setdefault(text, k) != k)
+            raise self.fault(
+                f"column {name!r}: {names[row]!r} stands in row {first[names[row]]} too; "
+                "expected each name once",
+                row,
+            )
+        return tuple(names)
+
+    def number_lists(self, name: str, count: int | None = None) -> Lists:
+        """Lists of finite numbers, `count` in each row if that is given."""
+        lists = self._number_lists(name, self._column(name, _is_number_list, "list<double>"))
+        if count is not None:
+            self.refuse(
+                lists.count != count,
+                lambda row: f"column {name!r}: expected {count} numbers, found {lists.count[row]}",
+            )
+        return lists
+
+    def points(self, name: str, *, optional: bool = False) -> Lists:
+        """A point of three numbers in each row; where `optional`, `count` is 0 for none."""
+        column = self._column(name, _is_number_list, "list<double>", nullable=optional)
+        if column is None:
+            return Lists(np.zeros((0, 3)), np.zeros(len(self), dtype=np.int64))
+        known = column.is_valid().to_numpy(zero_copy_only=False)
+        lists = self._number_lists(name, column)
+        self.refuse(
+            known & (lists.count != 3),
+            lambda row: f"column {name!r}: expected 3 numbers, found {lists.count[row]}",
+        )
+        return Lists(lists.values.reshape(-1, 3), known.astype(np.int64))
+
+    def point_lists(self, name: str, *, optional: bool = False) -> Lists:
+        """Lists of points of three numbers; where `optional`, a row may have none (`count` 0)."""
+        column = self._column(name, _is_point_list, "list<list<double>>", nullable=optional)
+        if column is None:
+            return Lists(np.zeros((0, 3)), np.zeros(len(self), dtype=np.int64))
+        count = _lengths(column)
+        row = np.repeat(np.arange(len(self)), count)
+        inner = column.flatten()
+        if inner.null_count:
+            bad = int(inner.is_null().to_numpy(zero_copy_only=False).argmax())
+            raise self.fault(f"column {name!r}: a point is null; expected 3 numbers", int(row[bad]))
+        if pa.types.is_null(inner.type):
+            return Lists(np.zeros((0, 3)), count)
+        size = _lengths(inner)
+        if (size != 3).any():
+            bad = int((size != 3).argmax())
+            raise self.fault(
+                f"column {name!r}: a point has {size[bad]} numbers; expected 3", int(row[bad])
+            )
+        values = self._values(name, inner.flatten(), np.repeat(row, 3))
+        return Lists(values.reshape(-1, 3), count)
+
+    def _number_lists(self, name: str, column: pa.Array) -> Lists:
+        count = _lengths(column)
+        row = np.repeat(np.arange(len(self)), count)
+        return Lists(self._values(name, column.flatten(), row), count)
+
+    def _values(
+        self, name: str, flat: pa.Array, row: Int[np.ndarray, " p"]
+    ) -> Float[np.ndarray, " p"]:
+        values = np.array(flat.cast(pa.float64()).fill_null(np.nan).to_numpy())
+        bad = ~np.isfinite(values)
+        if bad.any():
+            first = int(bad.argmax())
+            found = values[first] if flat[first].is_valid else "null"
+            rule = f"column {name!r}: expected finite numbers, found {found}"
+            raise self.fault(rule, int(row[first]))
+        return values
+
+    def _column(
+        self, name: str, fits: Callable[[pa.DataType], bool], expected: str, nullable: bool = False
+    ) -> pa.Array | None:
+        """The column as one array of a type that fits; None if unknown throughout and `nullable`."""
+        if name not in self:
+            return None
+        column = self._table.column(name).combine_chunks()
+        if pa.types.is_null(column.type) and (nullable or len(column) == 0):
+            # Nobody can tell the type of a column without a value; it is what was expected.
+            return None if nullable else pa.array([], _EMPTY[expected])
+        if not fits(column.type):
+            raise self.fault(f"column {name!r} has type {column.type}; expected {expected}")
+        if not nullable and column.null_count:
+            row = int(column.is_null().to_numpy(zero_copy_only=False).argmax())
+            raise self.fault(f"column {name!r} is null; expected a value in every row", row)
+        return column
+
+
+_EMPTY = {
+    "int64": pa.int64(),
+    "float64": pa.float64(),
+    "float": pa.float64(),
+    "string": pa.string(),
+    "list<double>": pa.list_(pa.float64()),
+    "list<list<double>>": pa.list_(pa.list_(pa.float64())),
+}
+
+
+def _read(path: Path, required: Sequence[str], optional: Sequence[str]) -> pa.Table:
+    if not path.is_file():
+        found = "a folder is there instead" if path.is_dir() else "the file is missing"
+        raise InputError(f"{path}: {found}; expected a Parquet file (with no rows if need be)")
+    try:
+        with pq.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            wanted = [name for name in (*required, *optional) if name in names]
+            _check_names(path, names, required, wanted)
+            return file.read(columns=wanted)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{path}: cannot be read as Parquet ({one_line(error)})") from error
+
+
+def _check_names(
+    path: Path, names: Sequence[str], required: Sequence[str], wanted: Sequence[str]
+) -> None:
+    for name in required:
+        if name not in names:
+            raise InputError(
+                f"{path}: column {name!r} is missing; expected {', '.join(required)}, "
+                f"found {', '.join(names) or 'no columns'}"
+            )
+    for name in wanted:
+        if names.count(name) > 1:
+            raise InputError(f"{path}: column {name!r} is there twice; expected it once")
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return (
+        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    )
+
+
+def _is_number_list(kind: pa.DataType) -> bool:
+    # A column of empty lists has no type inside.
+    return _is_list(kind) and kind.value_type in (pa.float32(), pa.float64(), pa.null())
+
+
+def _is_point_list(kind: pa.DataType) -> bool:
+    return _is_list(kind) and (_is_number_list(kind.value_type) or kind.value_type == pa.null())
+
+
+def _lengths(column: pa.Array) -> Int[np.ndarray, " n"]:
+    return column.value_lengths().fill_null(0).to_numpy().astype(np.int64)

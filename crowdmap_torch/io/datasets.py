@@ -1,0 +1,164 @@
+"""Datasets on disk to `tables.Dataset`: what FORMAT.md asks for is checked here, at the door."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from crowdmap_torch.io.detections import DROPPED_LANE, DROPPED_SIGN, read_lanes, read_signs
+from crowdmap_torch.io.documents import Document, read_json
+from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.poses import read_poses
+from crowdmap_torch.io.rigs import read_rig
+from crowdmap_torch.tables import Dataset, Journey, Origin, RejectedJourney, Rig
+
+DATASET_FORMAT = "crowdmap-dataset"
+JOURNEY_FORMAT = "crowdmap-journey"
+
+
+def load_dataset(
+    path: Path | str, *, device: torch.device | str = "cpu", strict: bool = False
+) -> Dataset:
+    """The journeys of a dataset, in the order of their names, and those set aside with the reason.
+
+    InputError if the dataset itself breaks FORMAT.md, if no journey is left, or, `strict`, if a
+    single one is set aside.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: the dataset's folder is missing; expected dataset.json in it")
+    head = read_json(folder / "dataset.json")
+    head.require_format(DATASET_FORMAT)
+    origin = read_origin(head)
+    journeys: list[Journey] = []
+    names: list[tuple[str, ...]] = []
+    rejected: list[RejectedJourney] = []
+    rigs: dict[str, Rig | InputError] = {}
+    for journey_folder in _journey_folders(folder):
+        try:
+            journey, type_names = _load_journey(journey_folder, folder / "rigs", rigs)
+        except InputError as error:
+            if strict:
+                raise InputError(f"journey {journey_folder.name!r}: {error}") from error
+            rejected.append(RejectedJourney(journey_folder.name, str(error)))
+            continue
+        journeys.append(journey)
+        names.append(type_names)
+    if not journeys:
+        raise InputError(
+            f"{folder}: all {len(rejected)} journeys are set aside; the first, "
+            f"{rejected[0].journey_id!r}, because {rejected[0].reason}"
+        )
+    all_names = tuple(sorted(set().union(*names)))
+    recoded = (
+        _moved(_recode(journey, own, all_names), device)
+        for journey, own in zip(journeys, names, strict=True)
+    )
+    return Dataset(
+        origin=origin,
+        journeys=tuple(recoded),
+        rejected=tuple(rejected),
+        type_names=all_names,
+    )
+
+
+def load_journey(
+    path: Path | str, *, device: torch.device | str = "cpu"
+) -> tuple[Journey, tuple[str, ...]]:
+    """One journey of a dataset, and the traffic-sign codes that its `type` column counts.
+
+    InputError if it breaks FORMAT.md.
+    """
+    folder = Path(path)
+    journey, type_names = _load_journey(folder, folder.parent.parent / "rigs", {})
+    return _moved(journey, device), type_names
+
+
+def read_origin(head: Document) -> Origin:
+    """The `origin` of a dataset.json or map.json."""
+    origin = head.part("origin")
+    return Origin(
+        lat_deg=origin.number("lat_deg", low=-90, high=90),
+        lon_deg=origin.number("lon_deg", low=-180, high=180),
+        height_m=origin.number("height_m", low=-12_000, high=12_000),
+    )
+
+
+def sign_row_count(journey: Journey) -> int:
+    """How many rows the journey's signs.parquet has, those dropped at the door included."""
+    return len(journey.signs) + _dropped_rows(journey, DROPPED_SIGN)
+
+
+def lane_row_count(journey: Journey) -> int:
+    """How many rows the journey's lanes.parquet has, those dropped at the door included."""
+    return len(journey.lanes) + _dropped_rows(journey, DROPPED_LANE)
+
+
+def _journey_folders(folder: Path) -> list[Path]:
+    journeys = folder / "journeys"
+    if not journeys.is_dir():
+        raise InputError(f"{journeys}: the folder is missing; expected one folder for each journey")
+    found = [p for p in journeys.iterdir() if p.is_dir() and not p.name.startswith(".")]
+    if not found:
+        raise InputError(f"{journeys}: has no journeys; expected one folder for each journey")
+    return sorted(found)
+
+
+def _load_journey(
+    folder: Path, rigs_folder: Path, rigs: dict[str, Rig | InputError]
+) -> tuple[Journey, tuple[str, ...]]:
+    """A journey with the codes of its own signs; `rigs` keeps rigs, or what is wrong with them."""
+    head = read_json(folder / "journey.json")
+    head.require_format(JOURNEY_FORMAT)
+    journey_id = head.name("journey_id")
+    if journey_id != folder.name:
+        raise head.fault(
+            f"{journey_id!r} in the folder {folder.name!r}; expected the same name", "journey_id"
+        )
+    rig_id = head.name("rig")
+    if rig_id not in rigs:
+        try:
+            rigs[rig_id] = read_rig(rigs_folder / rig_id)
+        except InputError as error:
+            rigs[rig_id] = error
+    rig = rigs[rig_id]
+    if isinstance(rig, InputError):
+        raise InputError(str(rig))
+    poses = read_poses(folder / "poses.parquet")
+    frame_number = poses.frame_number.numpy()
+    signs = read_signs(folder / "signs.parquet", rig.camera, frame_number)
+    lanes = read_lanes(folder / "lanes.parquet", rig.camera, frame_number)
+    journey = Journey(
+        journey_id=journey_id,
+        rig=rig,
+        frame_number=poses.frame_number,
+        t_ns=poses.t_ns,
+        T_world_camera=poses.T_world_link @ rig.T_link_camera,
+        sigma_position=poses.sigma_position,
+        sigma_rotation=poses.sigma_rotation,
+        signs=signs.detections,
+        lanes=lanes.detections,
+        lane_points=lanes.points,
+        dropped=signs.dropped | lanes.dropped,
+    )
+    return journey, signs.type_names
+
+
+def _recode(journey: Journey, own: tuple[str, ...], names: tuple[str, ...]) -> Journey:
+    """The journey with the signs' `type` counted in `names` instead of its own list."""
+    place = {name: code for code, name in enumerate(names)}
+    # The last entry is for -1.
+    table = torch.tensor([*(place[name] for name in own), -1])
+    signs = replace(journey.signs, type=table[journey.signs.type])
+    return replace(journey, signs=signs)
+
+
+def _moved(journey: Journey, device: torch.device | str) -> Journey:
+    # Left alone where it is there already: journeys with one rig share what its camera has computed.
+    return journey if torch.device(device).type == "cpu" else journey.to(device)
+
+
+def _dropped_rows(journey: Journey, prefix: str) -> int:
+    return sum(count for reason, count in journey.dropped.items() if reason.startswith(prefix))

@@ -1,0 +1,100 @@
+"""Rigs on disk: `rig.yaml` and the mount beside it (FORMAT.md)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch.geometry.camera import COEFFICIENT_COUNTS, MODELS, Camera, closing_share
+from crowdmap_torch.geometry.rig import camera_in_link
+from crowdmap_torch.io.documents import Document, read_yaml
+from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.tables import Rig
+
+MIN_CLOSING_SHARE = 0.9
+"""A lens whose undistortion closes on a smaller share of the image is refused."""
+MAX_SIDE_PX = 32_768
+"""No camera's image is wider or higher; more is a slip of the keyboard."""
+UNIT_TOLERANCE = 1e-3
+"""How far from 1 the length of a unit vector or quaternion may be."""
+
+
+def read_rig(folder: Path) -> Rig:
+    """The rig of a folder of `rigs/`; InputError for what breaks FORMAT.md."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: the rig's folder is missing; expected rig.yaml in it")
+    rig = read_yaml(folder / "rig.yaml")
+    rig.allow(("camera", "road"), ("mount",))
+    camera = _read_camera(rig.part("camera"))
+    normal, height = _read_road(rig.part("road"))
+    T_link_camera = torch.eye(4, dtype=torch.float64)
+    if "mount" in rig.content:
+        T_link_camera = _read_mount(rig.part("mount"), folder)
+    return Rig(
+        rig_id=folder.name,
+        camera=camera,
+        T_link_camera=T_link_camera,
+        road_normal_camera=normal,
+        camera_height=height,
+    )
+
+
+def _read_camera(section: Document) -> Camera:
+    section.allow(("model", "width", "height", "fx", "fy", "cx", "cy", "distortion"))
+    model = section.text("model")
+    if model not in MODELS:
+        raise section.fault(f"expected one of {', '.join(MODELS)}, found {model!r}", "model")
+    distortion = section.numbers("distortion")
+    if len(distortion) not in (counts := COEFFICIENT_COUNTS[model]):
+        much = ", ".join(map(str, counts))
+        rule = f"expected {much} numbers for {model}, found {len(distortion)}"
+        raise section.fault(rule, "distortion")
+    fx, fy = section.positive("fx"), section.positive("fy")
+    cx, cy = section.number("cx"), section.number("cy")
+    camera = Camera(
+        model=model,
+        width=section.integer("width", low=2, high=MAX_SIDE_PX),
+        height=section.integer("height", low=2, high=MAX_SIDE_PX),
+        K=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
+        distortion=torch.tensor(distortion, dtype=torch.float64),
+    )
+    if not (share := closing_share(camera)) >= MIN_CLOSING_SHARE:
+        raise section.fault(
+            f"undistortion closes on {share:.0%} of the image; "
+            f"expected {MIN_CLOSING_SHARE:.0%} or more. "
+            "Are the coefficients in OpenCV's order, and fx, fy, cx, cy of this image size?",
+            "distortion",
+        )
+    return camera
+
+
+def _read_road(section: Document) -> tuple[Float[Tensor, " 3"], float]:
+    section.allow(("normal", "height_m"))
+    normal = torch.tensor(section.numbers("normal", 3), dtype=torch.float64)
+    length = math.hypot(*normal.tolist())
+    if abs(length - 1) > UNIT_TOLERANCE:
+        raise section.fault(f"expected a unit vector, found one of length {length:.6g}", "normal")
+    return normal / length, section.positive("height_m")
+
+
+def _read_mount(section: Document, folder: Path) -> Float[Tensor, "4 4"]:
+    section.allow(("urdf", "pose_link", "camera_link"))
+    name = section.text("urdf")
+    path = folder / name
+    # Resolved, so that neither `..` nor a link leads out of the rig's folder.
+    if Path(name).is_absolute() or not path.resolve().is_relative_to(folder.resolve()):
+        raise section.fault(f"expected a file inside the rig's folder, found {name!r}", "urdf")
+    if not path.is_file():
+        raise section.fault(f"the file {path} is missing", "urdf")
+    try:
+        return camera_in_link(
+            path.read_bytes(), section.text("pose_link"), section.text("camera_link")
+        )
+    except (ValueError, OSError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: {one_line(error)}") from error

@@ -1,0 +1,97 @@
+"""Surveys on disk: maps of which only places must be known (FORMAT.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.columns import Sheet
+from crowdmap_torch.io.datasets import read_origin
+from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.landmarks import center_of, read_corners, read_normals, read_sigma
+from crowdmap_torch.io.maps import read_map_head
+from crowdmap_torch.tables import LANE_TYPES, Survey, SurveyLanePoints, SurveySigns
+
+
+def read_survey(path: Path | str) -> Survey:
+    """A survey; either of its two files may be missing. InputError for what breaks FORMAT.md."""
+    folder = Path(path)
+    head = read_map_head(folder)
+    signs_path, lanes_path = folder / "signs.parquet", folder / "lanes.parquet"
+    if not signs_path.exists() and not lanes_path.exists():
+        raise InputError(f"{folder}: has neither signs.parquet nor lanes.parquet; expected one")
+    sign_id, signs = _read_signs(signs_path) if signs_path.exists() else ((), _no_signs())
+    lane_id, lane_type, lane_points = (), _integers(), _no_points()
+    if lanes_path.exists():
+        lane_id, lane_type, lane_points = _read_lanes(lanes_path)
+    return Survey(
+        origin=read_origin(head),
+        sign_id=sign_id,
+        signs=signs,
+        lane_id=lane_id,
+        lane_type=lane_type,
+        lane_points=lane_points,
+    )
+
+
+def _read_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
+    sheet = Sheet(path, ("sign_id", "shape"), ("corners", "center", "normal", "sigma_m"))
+    sign_id = sheet.ids("sign_id")
+    shape = torch.from_numpy(sheet.codes("shape", polygon.SHAPES))
+    corners, has_corners = read_corners(sheet, shape, optional=True)
+    centers = sheet.points("center", optional=True)
+    has_center = centers.count > 0
+    sheet.refuse(
+        ~has_corners & ~has_center,
+        lambda row: "neither corners nor a center; expected one of them",
+    )
+    center = center_of(corners, polygon.corner_mask(shape)).numpy()
+    # Corners are the better witness: where they are known the centre is their mean.
+    center[has_center & ~has_corners] = centers.values[~has_corners[has_center]]
+    return sign_id, SurveySigns(
+        shape=shape,
+        corners_world=corners,
+        center_world=torch.from_numpy(center),
+        normal_world=read_normals(sheet, corners),
+        sigma=torch.from_numpy(read_sigma(sheet)),
+    )
+
+
+def _read_lanes(path: Path) -> tuple[tuple[str, ...], torch.Tensor, SurveyLanePoints]:
+    sheet = Sheet(path, ("lane_id", "points"), ("type",))
+    lane_id = sheet.ids("lane_id")
+    points = sheet.point_lists("points")
+    sheet.refuse(
+        points.count < 2,
+        lambda row: f"column 'points': {points.count[row]} points; expected 2 or more",
+    )
+    lane_type = torch.from_numpy(sheet.codes("type", LANE_TYPES, optional=True))
+    return (
+        lane_id,
+        lane_type,
+        SurveyLanePoints(
+            lane=torch.from_numpy(points.row), point_world=torch.from_numpy(points.values)
+        ),
+    )
+
+
+def _no_signs() -> SurveySigns:
+    empty = torch.zeros(0, 3, dtype=torch.float64)
+    return SurveySigns(
+        shape=_integers(),
+        corners_world=empty.new_zeros(0, polygon.MAX_CORNERS, 3),
+        center_world=empty,
+        normal_world=empty,
+        sigma=empty[:, 0],
+    )
+
+
+def _no_points() -> SurveyLanePoints:
+    return SurveyLanePoints(lane=_integers(), point_world=torch.zeros(0, 3, dtype=torch.float64))
+
+
+def _integers() -> torch.Tensor:
+    return torch.from_numpy(np.zeros(0, dtype=np.int64))

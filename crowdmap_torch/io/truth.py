@@ -1,0 +1,187 @@
+"""The truth of a simulated dataset: scorers read it, the mapper never does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.tables import Journey, Rows, Survey
+
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+@dataclass(frozen=True)
+class JourneyTruth:
+    """The truth of one journey, aligned with the frames of its table and the rows of its files."""
+
+    journey: Journey
+    """As the mapper sees it."""
+    T_world_camera: Float[Tensor, "f 4 4"]
+    """True poses of the camera."""
+    sign: Int[Tensor, " r"]
+    """For each row of signs.parquet the survey's sign it shows; -1 for a false detection."""
+    sign_frame: Int[Tensor, " r"]
+    """Frame index of each row of signs.parquet; -1 where the row was dropped at the door."""
+    sign_outlier: Bool[Tensor, " r"]
+    """True where the detection's geometry is grossly wrong."""
+    lane: Int[Tensor, " q"]
+    """For each row of lanes.parquet the survey's lane it shows; -1 for a false detection."""
+    road_normal_camera: Float[Tensor, "f 3"]
+    """True unit normal from the camera towards the road."""
+    camera_height: Float[Tensor, " f"]
+    """True distance from the camera centre to the road plane [m]."""
+
+    @property
+    def T_true_given(self) -> Float[Tensor, "f 4 4"]:
+        """What takes the error of a frame's pose off a world point."""
+        return self.T_world_camera @ se3.inverse(self.journey.T_world_camera)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The truth of the journeys in use."""
+
+    journeys: tuple[JourneyTruth, ...]
+
+    def select(self, journey_ids: Iterable[str]) -> Truth:
+        """Only the journeys named."""
+        wanted = set(journey_ids)
+        return replace(
+            self, journeys=tuple(t for t in self.journeys if t.journey.journey_id in wanted)
+        )
+
+
+def has_truth(survey_folder: Path) -> bool:
+    """True if a survey comes with the truth of a simulation."""
+    return (survey_folder / "truth").is_dir()
+
+
+def read_truth(survey_folder: Path, survey: Survey, journeys: Sequence[Journey]) -> Truth:
+    """The truth of `journeys` from `survey/truth/`; ValueError if it does not fit them."""
+    return Truth(
+        journeys=tuple(
+            _read_journey_truth(survey_folder / "truth" / j.journey_id, survey, j) for j in journeys
+        )
+    )
+
+
+def _read_journey_truth(folder: Path, survey: Survey, journey: Journey) -> JourneyTruth:
+    like = journey.T_world_camera
+    poses = _read(folder / "poses.parquet", ("frame", *_POSE))
+    pose = _floats(poses, _POSE)[_rows_of_frames(folder / "poses.parquet", poses, journey)]
+    T_world_link = se3.make(se3.from_quaternion(pose[:, 3:]), pose[:, :3]).to(like)
+    road = _read(folder / "road.parquet", ("frame", "nx", "ny", "nz", "height_m"))
+    plane = _floats(road, ("nx", "ny", "nz", "height_m"))
+    plane = plane[_rows_of_frames(folder / "road.parquet", road, journey)].to(like)
+    sign, outlier = _read_labels(folder / "signs.parquet", "sign_id", survey.sign_id)
+    lane, _ = _read_labels(folder / "lanes.parquet", "lane_id", survey.lane_id)
+    frame = torch.full((len(sign),), -1, dtype=torch.int64)
+    row = journey.signs.row.cpu()
+    if len(row) and int(row.max()) >= len(sign):
+        raise ValueError(
+            f"{folder / 'signs.parquet'}: {len(sign)} rows, but the journey's signs.parquet has a "
+            f"row {int(row.max())}; expected a line for each row. Is it another dataset's truth?"
+        )
+    frame[row] = journey.signs.frame.cpu()
+    return JourneyTruth(
+        journey=journey,
+        T_world_camera=T_world_link @ journey.rig.T_link_camera,
+        sign=sign.to(like.device),
+        sign_frame=frame.to(like.device),
+        sign_outlier=outlier.to(like.device),
+        lane=lane.to(like.device),
+        road_normal_camera=plane[:, :3],
+        camera_height=plane[:, 3],
+    )
+
+
+def _read(path: Path, columns: Sequence[str]) -> pa.Table:
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(f"{path}: cannot be read as Parquet ({error})") from error
+    missing = [c for c in columns if c not in table.column_names]
+    if missing:
+        raise ValueError(f"{path}: expected columns {', '.join(columns)}; {missing[0]} is missing")
+    return table
+
+
+def _floats(table: pa.Table, columns: Sequence[str]) -> Float[Tensor, "n k"]:
+    values = [table.column(c).to_numpy().astype(np.float64) for c in columns]
+    return torch.as_tensor(np.stack(values, axis=-1))
+
+
+def _rows_of_frames(path: Path, table: pa.Table, journey: Journey) -> Int[Tensor, " f"]:
+    """Rows of the table in the order of the journey's frames."""
+    frame = torch.as_tensor(table.column("frame").to_numpy().astype(np.int64))
+    order = frame.argsort()
+    wanted = journey.frame_number.cpu()
+    place = torch.searchsorted(frame[order], wanted).clamp_max(max(len(frame) - 1, 0))
+    if len(wanted) and (len(frame) == 0 or not bool((frame[order][place] == wanted).all())):
+        raise ValueError(f"{path}: frames of journey {journey.journey_id} are missing")
+    return order[place]
+
+
+def _read_labels(
+    path: Path, column: str, ids: Sequence[str]
+) -> tuple[Int[Tensor, " r"], Bool[Tensor, " r"]]:
+    """For each row of a detection file what it shows (-1 none), and whether it is an outlier."""
+    table = _read(path, ("row", column))
+    row = torch.as_tensor(table.column("row").to_numpy().astype(np.int64))
+    label = index_in(table.column(column), ids)
+    unknown = torch.as_tensor(table.column(column).is_valid().to_numpy()) & (label < 0)
+    if bool(unknown.any()):
+        first = int(unknown.nonzero()[0, 0])
+        name = table.column(column)[first].as_py()
+        raise ValueError(f"{path}: row {first}: {column} {name!r} is not in the survey")
+    rows = int(row.max()) + 1 if len(row) else 0
+    outlier = torch.zeros(len(row), dtype=torch.bool)
+    if "outlier" in table.column_names:
+        outlier = torch.as_tensor(table.column("outlier").to_numpy().astype(bool))
+    return (
+        torch.full((rows,), -1, dtype=torch.int64).index_put((row,), label),
+        torch.zeros(rows, dtype=torch.bool).index_put((row,), outlier),
+    )
+
+
+def index_in(column: pa.ChunkedArray, ids: Sequence[str]) -> Int[Tensor, " n"]:
+    """The index in `ids` of each string of a column; -1 for null and for other strings."""
+    place = {name: index for index, name in enumerate(ids)}
+    encoded = column.combine_chunks().dictionary_encode()
+    if isinstance(encoded, pa.ChunkedArray):
+        encoded = encoded.combine_chunks()
+    code = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
+    # One entry more for null, which has the code -1.
+    of_code = [place.get(name, -1) for name in encoded.dictionary.to_pylist()]
+    return torch.tensor([*of_code, -1], dtype=torch.int64)[torch.as_tensor(code)]
+
+
+@dataclass(frozen=True)
+class SignAssociations(Rows):
+    """Rows of the journeys' signs files that are in a landmark of a map."""
+
+    journey: Int[Tensor, " a"]
+    """Index into the journey ids that were asked for."""
+    row: Int[Tensor, " a"]
+    landmark: Int[Tensor, " a"]
+    """Landmarks numbered from 0."""
+
+
+def read_associations(path: Path, journey_ids: Sequence[str]) -> SignAssociations:
+    """The sign rows of RUN/associations.parquet that are in a landmark, of the journeys named."""
+    table = _read(path, ("journey_id", "kind", "row", "landmark_id"))
+    journey = index_in(table.column("journey_id"), journey_ids)
+    names = table.column("landmark_id")
+    landmark = index_in(names, [name for name in names.unique().to_pylist() if name is not None])
+    row = torch.as_tensor(table.column("row").to_numpy().astype(np.int64))
+    is_sign = index_in(table.column("kind"), ("sign",)) == 0
+    return SignAssociations(journey, row, landmark)[is_sign & (journey >= 0) & (landmark >= 0)]

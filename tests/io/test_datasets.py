@@ -1,0 +1,569 @@
+"""Loading of datasets: what comes out of a sound one, and which line names each fault."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from crowdmap_torch.geometry import polygon, se3
+from crowdmap_torch.io.datasets import (
+    lane_row_count,
+    load_dataset,
+    load_journey,
+    sign_row_count,
+)
+from crowdmap_torch.io.errors import InputError
+
+
+def column(values: list, kind: pa.DataType) -> pa.Array:
+    return pa.array(values, kind)
+
+
+# --- a sound dataset -------------------------------------------------------------------------
+
+
+def test_journeys_come_in_the_order_of_their_names(tiny) -> None:
+    dataset = load_dataset(tiny.write())
+    assert [j.journey_id for j in dataset.journeys] == ["a", "b"]
+    assert dataset.rejected == ()
+    assert dataset.origin.lat_deg == 32.9
+
+
+def test_detections_come_in_the_order_of_frames_with_their_rows(tiny) -> None:
+    signs = load_dataset(tiny.write()).journeys[1].signs
+    assert signs.row.tolist() == [1, 2, 0]
+    assert signs.frame.tolist() == [0, 0, 2]
+    assert [polygon.SHAPES[k] for k in signs.shape] == ["triangle", "octagon", "rectangle"]
+    assert signs.track.tolist() == [-1, 8, 7]
+    assert signs.score.isnan().tolist() == [True, False, False]
+
+
+def test_slots_past_the_corners_repeat_the_last_corner(tiny) -> None:
+    triangle = load_dataset(tiny.write()).journeys[1].signs.corners_px[0]
+    assert triangle[:3].tolist() == [[80.0, 20.0], [90.0, 40.0], [70.0, 40.0]]
+    assert (triangle[3:] == triangle[2]).all()
+
+
+def test_ideal_coordinates_are_undistorted_pixels(tiny) -> None:
+    journey = load_dataset(tiny.write()).journeys[1]
+    expected = (journey.signs.corners_px - torch.tensor([59.5, 39.5])) / 100
+    torch.testing.assert_close(journey.signs.corners_ideal, expected)
+    expected = (journey.lane_points.px - torch.tensor([59.5, 39.5])) / 100
+    torch.testing.assert_close(journey.lane_points.ideal, expected)
+
+
+def test_lane_points_follow_their_detections(tiny) -> None:
+    journey = load_dataset(tiny.write()).journeys[1]
+    assert journey.lanes.row.tolist() == [1, 0]
+    assert journey.lanes.type.tolist() == [-1, 0]
+    assert journey.lane_points.detection.tolist() == [0, 0, 1, 1, 1]
+    assert journey.lane_points.px[2:, 0].tolist() == [60.0, 40.0, 20.0]
+
+
+def test_types_are_counted_in_one_list_of_the_dataset(tiny) -> None:
+    tiny.journeys["b"].signs["type"] = ["DE:274", "AT:9", None]
+    dataset = load_dataset(tiny.write())
+    assert dataset.type_names == ("AT:9", "DE:274", "US:R1-1")
+    assert dataset.journeys[0].signs.type.tolist() == [-1, 1, 2]
+    assert dataset.journeys[1].signs.type.tolist() == [0, -1, 1]
+
+
+def test_a_pose_goes_through_the_mount(tiny) -> None:
+    a, b = load_dataset(tiny.write()).journeys
+    torch.testing.assert_close(a.T_world_camera, b.T_world_camera @ a.rig.T_link_camera)
+    assert not torch.allclose(a.rig.T_link_camera, torch.eye(4, dtype=torch.float64))
+    assert a.rig.T_link_camera[:3, 3].tolist() == pytest.approx([1.5, 0.1, 1.4])
+
+
+def test_quaternions_and_normals_almost_of_unit_length_are_normalised(tiny) -> None:
+    for name in ("qx", "qy", "qz", "qw"):
+        tiny.journeys["b"].poses[name] = [1.0009 * q for q in tiny.journeys["b"].poses[name]]
+    tiny.rigs["b"]["road"]["normal"] = [0.0, 0.9995, 0.0]
+    journey = load_dataset(tiny.write()).journeys[1]
+    R = journey.T_world_camera[:, :3, :3]
+    identity = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
+    torch.testing.assert_close(R @ R.mT, identity, atol=1e-14, rtol=0)
+    assert float(journey.rig.road_normal_camera.norm()) == pytest.approx(1, abs=1e-15)
+
+
+def test_optional_columns_may_be_missing(tiny) -> None:
+    for name in ("type", "score", "track"):
+        del tiny.journeys["b"].signs[name]
+    for name in ("type", "score"):
+        del tiny.journeys["b"].lanes[name]
+    journey = load_dataset(tiny.write()).journeys[1]
+    assert journey.signs.type.tolist() == journey.signs.track.tolist() == [-1] * 3
+    assert bool(journey.signs.score.isnan().all())
+    assert journey.lanes.type.tolist() == [-1, -1]
+    assert journey.sigma_position is None
+    assert journey.sigma_rotation is None
+
+
+def test_optional_columns_may_be_null_throughout(tiny) -> None:
+    nothing = [None] * 3
+    tiny.journeys["b"].signs |= {"type": nothing, "score": nothing, "track": pa.nulls(3)}
+    tiny.journeys["b"].poses |= {f"sigma_{k}": [None] * 4 for k in ("e", "n", "u", "rot")}
+    dataset = load_dataset(tiny.write())
+    assert dataset.rejected == ()
+    assert dataset.journeys[1].signs.track.tolist() == [-1] * 3
+    assert dataset.journeys[1].sigma_position is None
+
+
+def test_sigmas_unknown_in_some_frames_hold_the_median_of_the_others(tiny) -> None:
+    tiny.journeys["b"].poses |= {
+        "sigma_e": [0.3, None, 0.5, 0.4],
+        "sigma_n": [0.3] * 4,
+        "sigma_u": [0.6] * 4,
+        "sigma_rot": [0.002] * 4,
+    }
+    journey = load_dataset(tiny.write()).journeys[1]
+    assert journey.sigma_position is not None
+    assert journey.sigma_rotation is not None
+    assert journey.sigma_position[:, 0].tolist() == [0.3, 0.4, 0.5, 0.4]
+    assert journey.sigma_rotation.tolist() == [0.002] * 4
+
+
+def test_position_sigmas_count_only_together(tiny) -> None:
+    tiny.journeys["b"].poses |= {"sigma_e": [0.3] * 4, "sigma_n": [0.3] * 4}
+    assert load_dataset(tiny.write()).journeys[1].sigma_position is None
+
+
+def test_further_columns_files_and_keys_are_ignored(tiny) -> None:
+    tiny.journeys["b"].signs["colour"] = [1.0, None, math.nan]
+    tiny.journeys["b"].head |= {"vehicle_id": "v", "started_at": "2026-05-01T10:00:00Z", "x": {}}
+    folder = tiny.write()
+    (folder / "journeys" / "notes.txt").write_text("not a journey")
+    (folder / "journeys" / ".hidden").mkdir()
+    assert load_dataset(folder).rejected == ()
+
+
+NUMBER_LISTS = [
+    pa.list_(pa.float64()),
+    pa.list_(pa.float32()),
+    pa.large_list(pa.float64()),
+]
+
+
+@pytest.mark.parametrize("kind", NUMBER_LISTS, ids=str)
+def test_lists_of_both_widths_and_integers_of_both_widths_are_the_same(tiny, kind) -> None:
+    reference = load_dataset(tiny.write()).journeys[1]
+    for columns in (tiny.journeys["b"].signs, tiny.journeys["b"].lanes):
+        columns["u"], columns["v"] = column(columns["u"], kind), column(columns["v"], kind)
+        columns["frame"] = column(columns["frame"], pa.int32())
+    tiny.journeys["b"].signs["track"] = column([7, None, 8], pa.int32())
+    tiny.journeys["b"].signs["shape"] = column(
+        tiny.journeys["b"].signs["shape"], pa.string()
+    ).dictionary_encode()
+    other = load_dataset(tiny.write()).journeys[1]
+    assert torch.equal(other.signs.corners_px, reference.signs.corners_px)
+    assert torch.equal(other.lane_points.px, reference.lane_points.px)
+    assert torch.equal(other.signs.track, reference.signs.track)
+
+
+@pytest.mark.parametrize("typed", [True, False], ids=["typed", "untyped"])
+def test_a_journey_may_have_no_detections(tiny, typed) -> None:
+    for columns in (tiny.journeys["b"].signs, tiny.journeys["b"].lanes):
+        for name in columns:
+            columns[name] = [] if typed else pa.nulls(0)
+    journey = load_dataset(tiny.write()).journeys[1]
+    assert len(journey.signs) == len(journey.lanes) == len(journey.lane_points) == 0
+    assert journey.signs.corners_px.shape == (0, 8, 2)
+
+
+def test_nothing_depends_on_the_order_of_rows(tiny) -> None:
+    reference = load_dataset(tiny.write()).journeys[1]
+    for columns in (tiny.journeys["b"].signs, tiny.journeys["b"].lanes):
+        for name in columns:
+            columns[name] = columns[name][::-1]
+    other = load_dataset(tiny.write()).journeys[1]
+    assert sorted(other.signs.corners_px[:, 0, 0].tolist()) == sorted(
+        reference.signs.corners_px[:, 0, 0].tolist()
+    )
+    assert torch.equal(other.signs.frame, reference.signs.frame)
+    assert torch.equal(other.lane_points.px, reference.lane_points.px)
+
+
+def test_a_journey_is_loaded_by_itself_as_in_its_dataset(tiny) -> None:
+    folder = tiny.write()
+    whole = load_dataset(folder).journeys[0]
+    alone, type_names = load_journey(folder / "journeys" / "a")
+    assert torch.equal(alone.T_world_camera, whole.T_world_camera)
+    assert type_names == ("DE:274", "US:R1-1")
+
+
+def test_poses_are_rotations_of_the_quaternion_convention(tiny) -> None:
+    # (qx qy qz qw) = (-.5, .5, -.5, .5): z forward along east, x to the south, y down.
+    journey = load_dataset(tiny.write()).journeys[1]
+    p_camera = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    p_world = se3.transform(journey.T_world_camera[0], p_camera)
+    assert p_world.tolist() == pytest.approx([3.0, -1.0, -2.0])
+
+
+# --- faults that set a journey aside ---------------------------------------------------------
+
+
+def put(file: str, name: str, values: list | pa.Array) -> Callable:
+    return lambda j: getattr(j, file).update({name: values})
+
+
+def change(file: str, name: str, row: int, value: object) -> Callable:
+    return lambda j: getattr(j, file)[name].__setitem__(row, value)
+
+
+def drop(file: str, name: str) -> Callable:
+    return lambda j: getattr(j, file).pop(name)
+
+
+def head(**changes: object) -> Callable:
+    return lambda j: j.head.update(changes)
+
+
+def replace(file: str, content: object) -> Callable:
+    return lambda j: setattr(j, file, content)
+
+
+def no_rows(j) -> None:
+    j.poses = {name: [] for name in j.poses}
+
+
+def stretched(j) -> None:
+    j.poses["qw"][2] = 0.51
+
+
+FAULTS = {
+    "journey.json missing": (replace("head", None), "journey.json: the file is missing"),
+    "journey.json no json": (replace("head", "{"), "journey.json: cannot be read as JSON"),
+    "journey.json a list": (replace("head", [1]), "journey.json: expected a mapping"),
+    "journey.json key twice": (
+        replace("head", '{"rig": "a", "rig": "b"}'),
+        "journey.json: .*'rig' is given twice",
+    ),
+    "journey.json NaN": (replace("head", '{"format": NaN}'), "journey.json: .*NaN is not allowed"),
+    "journey format": (head(format="crowdmap-map"), "format: expected 'crowdmap-journey'"),
+    "journey version": (head(version=2), "version: expected version 1, found 2"),
+    "journey version true": (head(version=True), "version: expected version 1, found True"),
+    "journey_id missing": (lambda j: j.head.pop("journey_id"), "journey_id: is missing"),
+    "journey_id of another": (head(journey_id="b"), "journey_id: 'b' in the folder 'a'"),
+    "journey_id a number": (head(journey_id=3), "journey_id: expected a text"),
+    "rig missing": (lambda j: j.head.pop("rig"), "rig: is missing"),
+    "rig unknown": (head(rig="nobody"), "nobody: the rig's folder is missing"),
+    "rig outside": (head(rig="../rigs/b"), "rig: expected the plain name of a folder"),
+    "rig dots": (head(rig=".."), "rig: expected the plain name of a folder"),
+    "poses missing": (replace("poses", None), "poses.parquet: the file is missing"),
+    "signs missing": (replace("signs", None), "signs.parquet: the file is missing"),
+    "lanes missing": (replace("lanes", None), "lanes.parquet: the file is missing"),
+    "poses empty file": (replace("poses", b""), "poses.parquet: cannot be read as Parquet"),
+    "signs corrupt": (replace("signs", b"PAR1 no PAR1"), "signs.parquet: cannot be read as Parq"),
+    "poses without rows": (no_rows, "poses.parquet: has no rows"),
+    "column missing": (drop("poses", "qz"), "poses.parquet: column 'qz' is missing"),
+    "signs column missing": (drop("signs", "u"), "signs.parquet: column 'u' is missing"),
+    "lanes column missing": (drop("lanes", "frame"), "lanes.parquet: column 'frame' is missing"),
+    "frame null": (change("poses", "frame", 1, None), "poses.parquet: row 1: column 'frame' is nu"),
+    "x null": (change("poses", "x", 2, None), "poses.parquet: row 2: column 'x' is null"),
+    "x NaN": (change("poses", "x", 2, math.nan), "row 2: column 'x': expected a finite number"),
+    "z infinite": (change("poses", "z", 0, math.inf), "row 0: column 'z': expected a finite"),
+    "qw NaN": (change("poses", "qw", 3, math.nan), "row 3: column 'qw': expected a finite"),
+    "quaternion length": (stretched, "poses.parquet: row 2: quaternion .* has length 1.005"),
+    "x a text": (
+        put("poses", "x", column(["0"] * 4, pa.string())),
+        "poses.parquet: column 'x' has type string; expected float64",
+    ),
+    "x single": (
+        put("poses", "x", column([0.0] * 4, pa.float32())),
+        "poses.parquet: column 'x' has type float; expected float64",
+    ),
+    "frame a float": (
+        put("poses", "frame", column([10.0, 11.0, 13.0, 14.0], pa.float64())),
+        "poses.parquet: column 'frame' has type double; expected int64",
+    ),
+    "t_ns a timestamp": (
+        put("poses", "t_ns", column([1, 2, 3, 4], pa.timestamp("ns"))),
+        r"column 't_ns' has type timestamp\[ns\]; expected int64",
+    ),
+    "frame twice": (
+        put("poses", "frame", [10, 11, 11, 14]),
+        "poses.parquet: row 2: column 'frame': 11 after 11; expected strictly increasing",
+    ),
+    "frame falls": (put("poses", "frame", [10, 9, 13, 14]), "row 1: column 'frame': 9 after 10"),
+    "time stands": (put("poses", "t_ns", [1, 2, 2, 3]), "row 2: column 't_ns': 2 after 2"),
+    "sigma below zero": (
+        put("poses", "sigma_rot", [0.1, -0.1, 0.1, 0.1]),
+        "row 1: column 'sigma_rot': expected 0 or more",
+    ),
+    "sigma NaN": (
+        put("poses", "sigma_e", [0.1, 0.1, math.nan, 0.1]),
+        "row 2: column 'sigma_e': expected a finite",
+    ),
+    "sign frame": (change("signs", "frame", 1, 12), "signs.parquet: row 1: frame 12 is not in"),
+    "sign frame beyond": (change("signs", "frame", 2, 99), "signs.parquet: row 2: frame 99"),
+    "lane frame": (change("lanes", "frame", 1, -1), "lanes.parquet: row 1: frame -1 is not in"),
+    "shape unknown": (
+        change("signs", "shape", 1, "round"),
+        "signs.parquet: row 1: column 'shape': 'round' is unknown; expected one of triangle",
+    ),
+    "shape null": (change("signs", "shape", 0, None), "row 0: column 'shape' is null"),
+    "shape a number": (put("signs", "shape", column([1, 2, 3], pa.int64())), "'shape' has type"),
+    "too few corners": (
+        lambda j: (j.signs["u"][0].pop(), j.signs["v"][0].pop()),
+        "signs.parquet: row 0: rectangle with 3 corners; expected 4",
+    ),
+    "too many corners": (
+        lambda j: (j.signs["u"][1].append(75.0), j.signs["v"][1].append(30.0)),
+        "signs.parquet: row 1: triangle with 4 corners; expected 3",
+    ),
+    "u shorter than v": (
+        lambda j: j.signs["u"][0].pop(),
+        "signs.parquet: row 0: 3 values in u and 4 in v",
+    ),
+    "lane u shorter": (lambda j: j.lanes["u"][0].pop(), "lanes.parquet: row 0: 2 values in u and"),
+    "u null": (change("signs", "u", 2, None), "signs.parquet: row 2: column 'u' is null"),
+    "u holds null": (
+        change("signs", "u", 1, [80.0, None, 70.0]),
+        "signs.parquet: row 1: column 'u': expected finite numbers, found null",
+    ),
+    "u holds NaN": (
+        change("signs", "u", 1, [80.0, math.nan, 70.0]),
+        "signs.parquet: row 1: column 'u': expected finite numbers, found nan",
+    ),
+    "v infinite": (
+        change("lanes", "v", 1, [50.0, -math.inf]),
+        "lanes.parquet: row 1: column 'v': expected finite numbers, found -inf",
+    ),
+    "u of integers": (
+        put("lanes", "u", column([[1, 2, 3], [4, 5]], pa.list_(pa.int64()))),
+        r"lanes.parquet: column 'u' has type list<.*int64>; expected list<double>",
+    ),
+    "u no list": (put("signs", "u", column([1.0, 2.0, 3.0], pa.float64())), "'u' has type double"),
+    "one lane point": (
+        lambda j: j.lanes.update(u=[[1.0], [2.0, 3.0]], v=[[1.0], [2.0, 3.0]]),
+        "lanes.parquet: row 0: lane marker with 1 points; expected 2 or more",
+    ),
+    "no lane point": (
+        lambda j: j.lanes.update(u=[[], [2.0, 3.0]], v=[[], [2.0, 3.0]]),
+        "lanes.parquet: row 0: lane marker with 0 points",
+    ),
+    "lane type": (change("lanes", "type", 0, "dotted"), "row 0: column 'type': 'dotted' is unkno"),
+    "score above 1": (change("signs", "score", 0, 1.5), "row 0: column 'score': expected 0 to 1"),
+    "score below 0": (change("lanes", "score", 1, -0.1), "row 1: column 'score': expected 0 to 1"),
+    "score NaN": (change("signs", "score", 0, math.nan), "column 'score': expected a finite"),
+    "type a number": (put("signs", "type", column([1, 2, 3], pa.int64())), "'type' has type int64"),
+    "track a float": (
+        put("signs", "track", column([1.0, None, 2.0], pa.float64())),
+        "column 'track' has type double; expected int64",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_sets_the_journey_aside_in_one_line(tiny, fault) -> None:
+    spoil, reason = FAULTS[fault]
+    spoil(tiny.journeys["a"])
+    folder = tiny.write()
+    dataset = load_dataset(folder)
+    assert [j.journey_id for j in dataset.journeys] == ["b"]
+    assert [r.journey_id for r in dataset.rejected] == ["a"]
+    line = dataset.rejected[0].reason
+    assert "\n" not in line
+    with pytest.raises(InputError, match=reason):
+        load_journey(folder / "journeys" / "a")
+    with pytest.raises(InputError, match="journey 'a': ") as error:
+        load_dataset(folder, strict=True)
+    assert line in str(error.value)
+
+
+def test_a_column_that_is_there_twice_is_refused(tiny) -> None:
+    folder = tiny.write()
+    path = folder / "journeys" / "a" / "poses.parquet"
+    table = pq.read_table(path)
+    pq.write_table(
+        pa.Table.from_arrays([*table.columns, table.column("x")], names=[*table.column_names, "x"]),
+        path,
+    )
+    assert "column 'x' is there twice" in load_dataset(folder).rejected[0].reason
+
+
+def test_text_that_is_not_utf8_is_refused(tiny) -> None:
+    raw = pa.array([b"\xff\xfe", b"ok", b"ok"], pa.binary()).view(pa.string())
+    tiny.journeys["a"].signs["type"] = raw
+    assert "column 'type': expected UTF-8" in load_dataset(tiny.write()).rejected[0].reason
+
+
+def test_a_broken_rig_sets_all_its_journeys_aside(tiny) -> None:
+    tiny.rigs["a"]["camera"]["fx"] = -1
+    tiny.journeys["c"] = copy.deepcopy(tiny.journeys["a"])
+    tiny.journeys["c"].head["journey_id"] = "c"
+    dataset = load_dataset(tiny.write())
+    assert [r.journey_id for r in dataset.rejected] == ["a", "c"]
+    assert dataset.rejected[0].reason == dataset.rejected[1].reason
+
+
+# --- faults of one detection's geometry ------------------------------------------------------
+
+
+def quad(u: list[float], v: list[float]) -> Callable:
+    def spoil(journey) -> None:
+        for name, value in {"frame": 11, "shape": "rectangle", "u": u, "v": v}.items():
+            journey.signs[name].append(value)
+        for name in ("type", "score", "track"):
+            journey.signs[name].append(None)
+
+    return spoil
+
+
+SIGN_FAULTS = {
+    "anticlockwise": (quad([30, 30, 50, 50], [20, 30, 30, 20]), "sign: not clockwise"),
+    "bow tie": (quad([30, 50, 34, 50], [20, 20, 40, 34]), "sign: crosses itself"),
+    "a line": (quad([30, 40, 50, 45], [20, 25, 30, 27.5]), "sign: no area"),
+    "a point": (quad([30] * 4, [20] * 4), "sign: no area"),
+    "a corner twice": (quad([30, 50, 50, 50], [20, 20, 20, 30]), "sign: crosses itself"),
+    "left of the image": (quad([-0.6, 20, 20, 0], [5, 5, 15, 15]), "sign: outside the image"),
+    "right of the image": (quad([100, 119.6, 119, 100], [5, 5, 9, 9]), "sign: outside the image"),
+    "below the image": (quad([1, 9, 9, 1], [70, 70, 79.6, 79]), "sign: outside the image"),
+    "far outside": (quad([1e9, 2e9, 2e9, 1e9], [0, 0, 1e9, 1e9]), "sign: outside the image"),
+}
+
+
+@pytest.mark.parametrize("fault", SIGN_FAULTS)
+def test_a_sign_of_faulty_geometry_is_dropped_and_counted(tiny, fault) -> None:
+    spoil, reason = SIGN_FAULTS[fault]
+    spoil(tiny.journeys["b"])
+    dataset = load_dataset(tiny.write())
+    assert dataset.rejected == ()
+    journey = dataset.journeys[1]
+    assert journey.dropped == {reason: 1}
+    assert journey.signs.row.tolist() == [1, 2, 0]
+    assert sign_row_count(journey) == 4
+
+
+def test_the_image_reaches_half_a_pixel_beyond_the_outermost_centres(tiny) -> None:
+    quad([-0.5, 119.5, 119.5, -0.5], [-0.5, -0.5, 79.5, 79.5])(tiny.journeys["b"])
+    assert load_dataset(tiny.write()).journeys[1].dropped == {}
+
+
+FISHEYE = {
+    "model": "kannala_brandt",
+    "width": 400,
+    "height": 400,
+    "fx": 130.0,
+    "fy": 130.0,
+    "cx": 199.5,
+    "cy": 199.5,
+    "distortion": [0.0, 0.0, 0.0, 0.0],
+}
+
+
+def test_rays_85_degrees_or_more_off_the_axis_are_dropped(tiny) -> None:
+    # A fisheye without distortion terms: 130 px a radian; 84 degrees are 190.6 px, 86 are 195.1 px.
+    tiny.rigs["b"]["camera"] = dict(FISHEYE)
+    journey = tiny.journeys["b"]
+    for columns in (journey.signs, journey.lanes):
+        columns |= {name: [] for name in columns}
+    for angle in (84, 86):
+        edge = 199.5 + 130 * math.radians(angle)
+        quad([edge - 20, edge, edge, edge - 20], [195, 199.5, 205, 205])(journey)
+    loaded = load_dataset(tiny.write()).journeys[1]
+    assert loaded.signs.row.tolist() == [0]
+    assert loaded.dropped == {"sign: 85 degrees or more off the axis": 1}
+
+
+def test_corners_whose_undistortion_does_not_close_are_dropped(tiny) -> None:
+    # A barrel so strong that the image's corners lie beyond its fold: 7 % of the image.
+    tiny.rigs["b"]["camera"] |= {"distortion": [-0.32, 0.0, 0.0, 0.0]}
+    quad([0, 4, 4, 0], [0, 0, 4, 4])(tiny.journeys["b"])
+    journey = load_dataset(tiny.write()).journeys[1]
+    assert journey.dropped == {"sign: undistortion does not close": 1}
+
+
+def test_lane_points_outside_the_image_are_left_out(tiny) -> None:
+    tiny.journeys["b"].lanes["u"][0][1] = 200.0
+    journey = load_dataset(tiny.write()).journeys[1]
+    assert journey.dropped == {"lane point: outside the image": 1}
+    assert journey.lane_points.px[:, 0].tolist() == [70.0, 90.0, 60.0, 20.0]
+    assert lane_row_count(journey) == 2
+
+
+def test_a_lane_with_less_than_two_points_left_is_dropped(tiny) -> None:
+    tiny.journeys["b"].lanes["u"][0][1:] = [200.0, -3.0]
+    journey = load_dataset(tiny.write()).journeys[1]
+    assert journey.dropped == {
+        "lane: fewer than two usable points": 1,
+        "lane point: outside the image": 2,
+    }
+    assert journey.lanes.row.tolist() == [1]
+    assert journey.lane_points.detection.tolist() == [0, 0]
+    assert lane_row_count(journey) == 2
+
+
+def test_a_lane_without_length_is_dropped(tiny) -> None:
+    tiny.journeys["b"].lanes |= {"u": [[60.0] * 3, [70.0, 90.0]], "v": [[50.0] * 3, [50.0, 75.0]]}
+    journey = load_dataset(tiny.write()).journeys[1]
+    assert journey.dropped == {"lane: no length": 1}
+    assert journey.lanes.row.tolist() == [1]
+
+
+# --- faults of the dataset itself ------------------------------------------------------------
+
+
+def no_journeys(tiny) -> None:
+    tiny.journeys.clear()
+    (tiny.folder / "journeys").mkdir(parents=True)
+
+
+DATASET_FAULTS = {
+    "missing head": (lambda t: setattr(t, "head", None), "dataset.json: the file is missing"),
+    "no json": (lambda t: setattr(t, "head", "origin:"), "dataset.json: cannot be read as JSON"),
+    "format": (lambda t: t.head.update(format="x"), "format: expected 'crowdmap-dataset'"),
+    "version": (lambda t: t.head.update(version="1"), "version: expected version 1, found '1'"),
+    "no origin": (lambda t: t.head.pop("origin"), "dataset.json: origin: is missing"),
+    "latitude": (
+        lambda t: t.head["origin"].update(lat_deg=91),
+        "origin.lat_deg: expected a number in -90 to 90, found 91",
+    ),
+    "longitude": (lambda t: t.head["origin"].update(lon_deg=-181.0), "origin.lon_deg: expected"),
+    "height": (lambda t: t.head["origin"].update(height_m="120"), "origin.height_m: expected a nu"),
+    "no folder": (lambda t: t.journeys.clear(), "journeys: the folder is missing"),
+    "no journeys": (no_journeys, "journeys: has no journeys"),
+    "all set aside": (
+        lambda t: [j.poses.pop("x") for j in t.journeys.values()],
+        "all 2 journeys are set aside; the first, 'a', because .*column 'x' is missing",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", DATASET_FAULTS)
+def test_a_fault_of_the_dataset_is_one_line(tiny, fault) -> None:
+    spoil, reason = DATASET_FAULTS[fault]
+    spoil(tiny)
+    folder = tiny.write()
+    with pytest.raises(InputError, match=reason) as error:
+        load_dataset(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_a_dataset_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the dataset's folder is missing"):
+        load_dataset(tmp_path / "nowhere")
+
+
+# --- real drives -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drive", ["kitti-00", "kitti-05", "kitti-06", "kitti-08"])
+def test_real_drives_load(real_data, drive) -> None:
+    folder = real_data("kitti-signs") / drive
+    dataset = load_dataset(folder, strict=True)
+    (journey,) = dataset.journeys
+    rows = pq.read_metadata(folder / "journeys" / drive / "signs.parquet").num_rows
+    assert sign_row_count(journey) == rows
+    assert len(journey.signs) >= 0.99 * rows
+    assert len(journey.lanes) == 0
+    origin = json.loads((folder / "dataset.json").read_text())["origin"]
+    assert dataset.origin.lat_deg == origin["lat_deg"]
