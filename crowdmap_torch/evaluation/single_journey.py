@@ -1,0 +1,213 @@
+"""What one journey alone is worth, its pose error taken off (METRICS.md, One journey)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.evaluation.lanes import LaneEvaluationConfig, survey_samples
+from crowdmap_torch.evaluation.matching import DUPLICATE, FALSE, near_pairs
+from crowdmap_torch.evaluation.polyline import Samples, crossings, nearest, sample_lanes
+from crowdmap_torch.evaluation.signs import SignEvaluationConfig, compare_signs
+from crowdmap_torch.evaluation.statistics import (
+    ErrorFigures,
+    PositionFigures,
+    error_figures,
+    position_figures,
+    share,
+)
+from crowdmap_torch.evaluation.visibility import frames_of_signs
+from crowdmap_torch.geometry import camera as camera_module
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.io.truth import JourneyTruth
+from crowdmap_torch.tables import Lanes, Signs, Survey
+
+_SIGN_RANGE_M = 120.0
+_LANE_RANGE_M = 40.0
+"""Frames further from a landmark are not looked at for the closest approach."""
+_VIEW_STEP_M = 5.0
+"""Distance of the places along a lane whose closest approach is looked up."""
+
+
+@dataclass(frozen=True)
+class SingleJourneyConfig:
+    """Which true signs a journey is expected to map."""
+
+    min_frames: int = 10
+    """Recall is over true signs detected in this many frames of the journey."""
+    signs: SignEvaluationConfig = field(default_factory=SignEvaluationConfig)
+    lanes: LaneEvaluationConfig = field(default_factory=LaneEvaluationConfig)
+
+
+@dataclass(frozen=True)
+class JourneyLandmarks:
+    """What one journey alone made of the world: RUN/journeys/ID/signs.parquet and lanes.parquet."""
+
+    journey_id: str
+    signs: Signs
+    lanes: Lanes
+
+
+@dataclass(frozen=True)
+class SingleJourneyFigures:
+    """Figures [m] over the landmarks of all journeys, the true pose errors taken off."""
+
+    journeys: int
+    signs: int
+    corner: PositionFigures
+    center: PositionFigures
+    normal_deg: ErrorFigures
+    recall: float
+    """Of the true signs detected in ten or more frames, journey by journey."""
+    duplicates: float
+    """Share of the landmarks that stand beside a true sign that another one has taken."""
+    ghosts: float
+    """Share of the landmarks further than 3 m from every true sign."""
+    lane_lateral: ErrorFigures
+    lane_vertical: ErrorFigures
+    lane_precision: float
+    """Share of the lanes' length within the gate of a true marker."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The raw numbers of one journey, to be put together over all."""
+
+    corner: Float[Tensor, "k 8 3"]
+    corner_mask: Bool[Tensor, "k 8"]
+    center: Float[Tensor, "k 1 3"]
+    normal_deg: Float[Tensor, " k"]
+    lateral: Float[Tensor, " p"]
+    vertical: Float[Tensor, " p"]
+    expected: int
+    found: int
+    duplicates: int
+    false: int
+    signs: int
+    lane_samples: int
+    lane_right: int
+
+
+def evaluate_single_journeys(
+    landmarks: list[JourneyLandmarks],
+    truths: list[JourneyTruth],
+    survey: Survey,
+    config: SingleJourneyConfig | None = None,
+) -> SingleJourneyFigures:
+    """Figures over the landmarks of journeys; `truths` in the same order."""
+    config = config or SingleJourneyConfig()
+    samples = survey_samples(survey, config.lanes.step_m)
+    parts = [
+        _evaluate_one(one, truth, survey, samples, config)
+        for one, truth in zip(landmarks, truths, strict=True)
+    ]
+    if not parts:
+        raise ValueError("no journey to evaluate: expected at least one with landmarks and truth")
+    corner, mask, center, normal, lateral, vertical = (
+        torch.cat([getattr(p, name) for p in parts])
+        for name in ("corner", "corner_mask", "center", "normal_deg", "lateral", "vertical")
+    )
+    signs = sum(p.signs for p in parts)
+    return SingleJourneyFigures(
+        journeys=len(parts),
+        signs=signs,
+        corner=position_figures(corner, mask, mask.any(-1)),
+        center=position_figures(
+            center, torch.ones_like(center[..., 0], dtype=torch.bool), torch.ones_like(mask[:, 0])
+        ),
+        normal_deg=error_figures(normal),
+        recall=share(sum(p.found for p in parts), sum(p.expected for p in parts)),
+        duplicates=share(sum(p.duplicates for p in parts), signs),
+        ghosts=share(sum(p.false for p in parts), signs),
+        lane_lateral=error_figures(lateral.abs()),
+        lane_vertical=error_figures(vertical.abs()),
+        lane_precision=share(sum(p.lane_right for p in parts), sum(p.lane_samples for p in parts)),
+    )
+
+
+def _evaluate_one(
+    landmarks: JourneyLandmarks,
+    truth: JourneyTruth,
+    survey: Survey,
+    true_samples: Samples,
+    config: SingleJourneyConfig,
+) -> _Part:
+    signs = without_pose_error(landmarks.signs, truth)
+    c = compare_signs(signs, survey.signs, config=config.signs)
+    expected = frames_of_signs(truth, len(survey.signs)) >= config.min_frames
+    found = torch.zeros_like(expected).index_fill(0, c.true_row, True)
+    mapped = sample_lanes(landmarks.lanes, config.lanes.step_m)
+    # A pose error changes slowly: samples share the view of one a few metres before them.
+    anchor = _anchors(mapped.line, max(round(_VIEW_STEP_M / config.lanes.step_m), 1))
+    anchors, of_sample = anchor.unique(return_inverse=True)
+    frame = closest_view(truth, mapped.point_world[anchors], _LANE_RANGE_M)[of_sample]
+    moved = se3.transform(truth.T_true_given[frame], mapped.point_world)
+    mapped = replace(mapped, point_world=moved)
+    # From the map's points to the true markers: a journey sees pieces, and nobody expects the rest
+    # of it.
+    on_marker = nearest(
+        crossings(
+            mapped,
+            true_samples,
+            lateral_m=config.lanes.lateral_gate_m,
+            vertical_m=config.lanes.vertical_gate_m,
+        )
+    )
+    return _Part(
+        corner=c.corner_error_world,
+        corner_mask=c.corner_mask,
+        center=c.center_error_world,
+        normal_deg=c.normal_deg,
+        lateral=on_marker.lateral,
+        vertical=on_marker.vertical,
+        expected=int(expected.sum()),
+        found=int((expected & found).sum()),
+        duplicates=int((c.match.true_of_map == DUPLICATE).sum()),
+        false=int((c.match.true_of_map == FALSE).sum()),
+        signs=len(signs),
+        lane_samples=len(mapped),
+        lane_right=len(on_marker),
+    )
+
+
+def _anchors(line: Int[Tensor, " p"], every: int) -> Int[Tensor, " p"]:
+    """For each sample the row of the last one on its line whose rank is a multiple of `every`."""
+    row = torch.arange(len(line), device=line.device)
+    _, count = torch.unique_consecutive(line, return_counts=True)
+    first = torch.repeat_interleave(count.cumsum(0) - count, count)
+    return row - (row - first) % every
+
+
+def without_pose_error(signs: Signs, truth: JourneyTruth) -> Signs:
+    """The signs as they would be had the pose at closest approach been the true one."""
+    frame = closest_view(truth, signs.center_world, _SIGN_RANGE_M)
+    return replace(signs, T_world_sign=truth.T_true_given[frame] @ signs.T_world_sign)
+
+
+def closest_view(
+    truth: JourneyTruth, point_world: Float[Tensor, "n 3"], range_m: float
+) -> Int[Tensor, " n"]:
+    """For each point (world as the given poses have it) the nearest frame that has it in its image.
+
+    A pose drifts on from where a landmark was last seen to where the car passes it, so it is
+    the view that counts; the nearest frame of all stands in where no frame within `range_m` has
+    the point in its image.
+    """
+    T_camera_world = se3.inverse(truth.journey.T_world_camera)
+    position = truth.journey.T_world_camera[:, :3, 3]
+    point, frame, distance = near_pairs(point_world, position, range_m)
+    in_camera = se3.transform(T_camera_world[frame], point_world[point])
+    _, visible = camera_module.project(truth.journey.rig.camera, in_camera)
+    # A frame that does not see the point loses against every frame that does, and the nearest of
+    # those is left otherwise.
+    cost = torch.where(visible, distance, distance + 10 * range_m)
+    order = cost.argsort(stable=True)
+    order = order[point[order].argsort(stable=True)]
+    point, frame = point[order], frame[order]
+    first = torch.ones_like(point, dtype=torch.bool)
+    first[1:] = point[1:] != point[:-1]
+    closest = torch.zeros(len(point_world), dtype=torch.int64, device=point_world.device)
+    return closest.index_put((point[first],), frame[first])
