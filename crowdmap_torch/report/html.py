@@ -1,0 +1,169 @@
+"""report.html: one file that opens without a network and tells a person what a run has made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from html import escape
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from crowdmap_torch.io.atomic import atomic_file
+from crowdmap_torch.report import plots
+from crowdmap_torch.report.assets import SCRIPT, STYLE
+from crowdmap_torch.report.map_svg import map_svg
+from crowdmap_torch.report.record import RunRecord
+from crowdmap_torch.report.tables_html import (
+    bias_table,
+    error_table,
+    headline_cards,
+    reasons_table,
+    sign_table,
+    simple_table,
+    timing_table,
+)
+
+
+def write_report(path: Path, record: RunRecord) -> None:
+    """Write `record` as one self-contained HTML file, complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as beside:
+        beside.write_text(report_html(record), encoding="utf-8")
+
+
+def report_html(record: RunRecord) -> str:
+    """The report as text."""
+    sections = [s for s in _sections(record) if s[2]]
+    links = "".join(f'<a href="#{name}">{escape(title)}</a>' for name, title, _ in sections)
+    body = "".join(
+        f'<section id="{name}"><h2>{escape(title)}</h2>{content}</section>'
+        for name, title, content in sections
+    )
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{escape(record.title)}</title><style>{STYLE}</style></head><body>"
+        f'<header><div class="wrap"><h1>{escape(record.title)}</h1>'
+        f"<p>{escape(record.subtitle)}</p></div></header>"
+        f'<nav><div class="wrap">{links}</div></nav><main class="wrap">{body}</main>'
+        '<footer class="wrap">All lengths in metres, east north up from the map\'s origin. '
+        f"</footer><script>{SCRIPT}</script></body></html>\n"
+    )
+
+
+def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
+    """Anchor, title and content of each section; those without content are left out."""
+    yield "headline", "At a glance", headline_cards(record)
+    yield "map", "Map", _map(record)
+    yield "errors", "Errors", _errors(record)
+    yield "journeys", "Journeys", _journeys(record)
+    yield "clusters", "Clusters", _clusters(record)
+    yield "residuals", "Residuals", _residuals(record)
+    yield "adjustment", "Bundle adjustment", _adjustment(record)
+    yield "signs", "Signs", sign_table(record)
+    yield "pruned", "Left out", _pruned(record)
+    yield "timings", "Timings", timing_table(record.timings_s)
+    yield "config", "Configuration", _config(record)
+
+
+def _map(record: RunRecord) -> str:
+    return _note("From above. A click on a row of the table of signs brings it here.") + map_svg(
+        record
+    )
+
+
+def _errors(record: RunRecord) -> str:
+    if record.figures is None:
+        return ""
+    drawing = ""
+    if record.comparison is not None and bool(record.comparison.counted.any()):
+        oracle = record.figures.oracle
+        drawing = _drawing(
+            plots.plot_sign_errors(
+                record.comparison,
+                record.comparison_before,
+                oracle_m=oracle.total.mean if oracle is not None else float("nan"),
+            )
+        )
+    return drawing + error_table(record.figures, record.figures_before)
+
+
+def _journeys(record: RunRecord) -> str:
+    named = [
+        *(("set aside", r) for r in record.rejected),
+        *(("suspect", r) for r in record.suspects),
+    ]
+    warning = ""
+    if named:
+        rows = [(kind, r.journey_id, r.reason) for kind, r in named]
+        warning = (
+            '<div class="box warn">' + simple_table(("", "journey", "reason"), rows) + "</div>"
+        )
+        warning = "<h3>Journeys set aside or without weight</h3>" + warning
+    if not record.journeys:
+        return warning
+    return (
+        _note("Bias: what the positioning module got wrong, in the mean over the journey.")
+        + _drawing(plots.plot_bias(record.journeys))
+        + bias_table(record.journeys)
+        + warning
+    )
+
+
+def _clusters(record: RunRecord) -> str:
+    if not record.spectra:
+        return ""
+    return _note(
+        "Eigenvalues of the graph Laplacian: as many are small as there are landmarks; "
+        "the gap after them is where the number was read off."
+    ) + _drawing(plots.plot_spectrum(record.spectra))
+
+
+def _residuals(record: RunRecord) -> str:
+    if not any(len(r) for r in record.residual_px.values()):
+        return ""
+    return _note("Share of the reprojection residuals below each size, stage by stage.") + _drawing(
+        plots.plot_residuals(record.residual_px)
+    )
+
+
+def _adjustment(record: RunRecord) -> str:
+    if not record.iterations:
+        return ""
+    steps = len(record.iterations)
+    first, last = record.iterations[0].total, record.iterations[-1].total
+    outcome = record.outcome[:1].upper() + record.outcome[1:]
+    told = f"{steps} iterations, cost {first:.4g} to {last:.4g}. {outcome}".strip()
+    return _note(told) + _drawing(plots.plot_convergence(record.iterations))
+
+
+def _pruned(record: RunRecord) -> str:
+    parts = []
+    if record.pruned:
+        parts.append(
+            "<div><h3>What was left out, and why</h3>" + reasons_table(record.pruned) + "</div>"
+        )
+    if record.counts:
+        rows = [(name, _count(value)) for name, value in record.counts.items()]
+        parts.append("<div><h3>Counts</h3>" + simple_table(("", "count"), rows) + "</div>")
+    return f'<div class="two">{"".join(parts)}</div>' if parts else ""
+
+
+def _config(record: RunRecord) -> str:
+    if not record.config_yaml:
+        return ""
+    return f'<div class="box"><pre>{escape(record.config_yaml)}</pre></div>'
+
+
+def _count(value: float | str) -> str:
+    if isinstance(value, str):
+        return value
+    return f"{value:,.0f}" if float(value).is_integer() else f"{value:.3f}"
+
+
+def _drawing(figure: Figure) -> str:
+    return f'<div class="box">{plots.svg(figure)}</div>'
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{escape(text)}</p>'

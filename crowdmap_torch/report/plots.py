@@ -1,0 +1,264 @@
+"""Figures of a run. Every function returns a matplotlib figure that no global state knows of."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar, cast
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from crowdmap_torch.evaluation.polyline import sample_lanes
+from crowdmap_torch.evaluation.signs import SignComparison
+from crowdmap_torch.evaluation.statistics import mean_lengths
+from crowdmap_torch.report.record import Iteration, JourneySummary, Spectrum
+from crowdmap_torch.tables import HdMap, Survey
+
+MAP, SURVEY, BEFORE, WRONG, FAINT, INK = (
+    "#2563c9",
+    "#178a50",
+    "#d9822b",
+    "#c4342d",
+    "#b8c0cc",
+    "#27303d",
+)
+"""Colours of the map, the survey, the map before adjustment, errors, what lies behind, and text."""
+SERIES = (MAP, BEFORE, SURVEY, "#8a56b8", WRONG, "#3aa0a8", "#7a8594")
+
+_STYLE: dict[Any, Any] = {
+    "axes.edgecolor": "#9aa4b2",
+    "axes.labelcolor": INK,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "grid.color": "#e7ebf0",
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+    # Names inside an SVG follow from this and the drawing alone: the same run gives the same file.
+    "svg.hashsalt": "crowdmap",
+    "text.color": INK,
+    "xtick.color": "#5b6675",
+    "ytick.color": "#5b6675",
+}
+
+
+Plot = TypeVar("Plot", bound=Callable[..., Figure])
+
+
+def _styled(plot: Plot) -> Plot:
+    """The same function, drawing in the style of the report whatever the style of the caller."""
+    return cast(Plot, mpl.rc_context(_STYLE)(plot))
+
+
+@_styled
+def plot_map(hd_map: HdMap, survey: Survey | None = None, *, title: str = "") -> Figure:
+    """A map from above, the survey under it."""
+    figure, (axes,) = _figure(1, width=9.0, height=5.0)
+    if survey is not None:
+        line = survey.lane_points.lane
+        _draw_lines(axes, survey.lane_points.point_world, line, SURVEY, width=2.4, alpha=0.45)
+        x, y = survey.signs.center_world[:, :2].cpu().unbind(-1)
+        axes.plot(x, y, "o", mfc="none", mec=SURVEY, ms=7, label="survey")
+    samples = sample_lanes(hd_map.lanes, 2.0)
+    _draw_lines(axes, samples.point_world, samples.line, MAP, width=0.9, alpha=1.0)
+    center, normal = hd_map.signs.center_world.cpu(), hd_map.signs.normal_world.cpu()
+    axes.plot(center[:, 0], center[:, 1], ".", color=MAP, ms=4, label="map")
+    if len(center):
+        axes.quiver(
+            *center[:, :2].unbind(-1),
+            *normal[:, :2].unbind(-1),
+            color=MAP,
+            width=0.0015,
+            scale=60,
+        )
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="east [m]", ylabel="north [m]", title=title)
+    if survey is not None:
+        axes.legend(loc="upper right")
+    return figure
+
+
+@_styled
+def plot_sign_errors(
+    comparison: SignComparison, before: SignComparison | None = None, *, oracle_m: float = math.nan
+) -> Figure:
+    """Histograms of the absolute and the relative error of signs (`sign_errors`)."""
+    figure, panels = _figure(2, width=9.0, height=2.9)
+    for axes, name in zip(panels, ("absolute", "relative"), strict=True):
+        now = sign_errors(comparison, name)
+        then = sign_errors(before, name) if before is not None else now[:0]
+        both = torch.cat((now, then))
+        top = float(both.max()) * 1.02 if len(both) else 1.0
+        edges = np.linspace(0, max(top, 1e-3), 25).tolist()
+        if len(then):
+            axes.hist(then.cpu(), edges, color=BEFORE, alpha=0.45, label="cluster heads")
+        axes.hist(now.cpu(), edges, color=MAP, alpha=0.75, label="map")
+        if len(now):
+            axes.axvline(float(now.mean()), color=MAP, lw=1.5, ls="--", label="mean of the map")
+        if name == "absolute" and math.isfinite(oracle_m):
+            axes.axvline(oracle_m, color=INK, lw=1.5, ls=":", label="oracle")
+        axes.set(xlabel="error [m]", ylabel="signs", title=f"{name} error")
+        axes.legend(loc="upper right")
+    return figure
+
+
+def sign_errors(comparison: SignComparison, name: str) -> Float[Tensor, " k"]:
+    """The `absolute` or `relative` error of each matched observable sign [m].
+
+    The mean over its corners; of the centre where no corners were surveyed.
+    """
+    c = comparison
+    corner = c.corner_error_world if name == "absolute" else c.relative_corner_world
+    center = c.center_error_world if name == "absolute" else c.relative_center_world
+    at_corners, _, _ = mean_lengths(corner, c.corner_mask)
+    error = torch.where(c.corner_mask.any(-1), at_corners, center[:, 0].norm(dim=-1))
+    return error[c.counted & c.has_relative if name == "relative" else c.counted]
+
+
+@_styled
+def plot_bias(journeys: Sequence[JourneySummary]) -> Figure:
+    """The bias of each journey from above, and its height; the true one where it is known."""
+    figure, (plan, height) = _figure(2, width=9.0, height=3.4)
+    bias = np.array([j.bias for j in journeys]).reshape(-1, 3)
+    known = [k for k, j in enumerate(journeys) if j.true_bias is not None]
+    true = np.array([j.true_bias for j in journeys if j.true_bias is not None]).reshape(-1, 3)
+    for row, k in enumerate(known):
+        plan.plot(*np.stack((bias[k, :2], true[row, :2]), axis=-1), color=FAINT, lw=1, zorder=1)
+    plan.plot(true[:, 0], true[:, 1], "o", mfc="none", mec=SURVEY, ms=6, label="true")
+    plan.plot(bias[:, 0], bias[:, 1], ".", color=MAP, ms=7, label="estimated")
+    plan.axhline(0, color=FAINT, lw=0.8)
+    plan.axvline(0, color=FAINT, lw=0.8)
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.set(xlabel="east [m]", ylabel="north [m]", title="bias of each journey")
+    number = np.arange(len(journeys))
+    height.bar(number, bias[:, 2], color=MAP, width=0.6, label="estimated")
+    height.plot(number[known], true[:, 2], "o", mfc="none", mec=SURVEY, ms=6, label="true")
+    height.axhline(0, color=FAINT, lw=0.8)
+    height.set(xlabel="journey", ylabel="up [m]", title="its vertical part")
+    if known:
+        plan.legend(loc="best")
+    return figure
+
+
+@_styled
+def plot_spectrum(spectra: Sequence[Spectrum]) -> Figure:
+    """Eigenvalues of graph Laplacians, ascending, and the gap that was chosen."""
+    figure, panels = _figure(max(len(spectra), 1), width=9.0, height=2.9)
+    for axes, spectrum in zip(panels, spectra, strict=False):
+        value = np.asarray(spectrum.eigenvalue)
+        number = np.arange(1, len(value) + 1)
+        below = number <= spectrum.clusters
+        axes.plot(number[below], value[below], ".", color=MAP, ms=5)
+        axes.plot(number[~below], value[~below], ".", color=FAINT, ms=5)
+        if 0 < spectrum.clusters < len(value):
+            low, high = value[spectrum.clusters - 1], value[spectrum.clusters]
+            axes.axhspan(low, high, color=BEFORE, alpha=0.15, lw=0)
+            axes.axvline(spectrum.clusters + 0.5, color=BEFORE, lw=1.2)
+            axes.annotate(
+                f"gap {high - low:.2f}",
+                (spectrum.clusters + 0.5, (low + high) / 2),
+                xytext=(5, 0),
+                textcoords="offset points",
+                color=BEFORE,
+                va="center",
+            )
+        title = f"{spectrum.title}: {spectrum.clusters} clusters"
+        axes.set(xlabel="number", ylabel="eigenvalue", title=title)
+    return figure
+
+
+@_styled
+def plot_residuals(residual_px: Mapping[str, Float[Tensor, " n"]]) -> Figure:
+    """The share of residuals below each size, stage by stage; further left is better."""
+    figure, (axes,) = _figure(1, width=9.0, height=3.0)
+    for (stage, residual), color in zip(residual_px.items(), SERIES * 9, strict=False):
+        # Exact zeros have no logarithm.
+        known = residual.detach().abs()[residual.isfinite()].clamp_min(1e-3).sort().values.cpu()
+        if len(known) == 0:
+            continue
+        rank = torch.linspace(0, len(known) - 1, min(len(known), 400)).long()
+        median = float(known[(len(known) - 1) // 2])
+        share = (rank + 1) / len(known)
+        axes.plot(known[rank], share, color=color, label=f"{stage} (median {median:.2f} px)")
+    axes.set_xscale("log")
+    # Exact zeros and near zeros would take most of a logarithmic axis.
+    axes.set_xlim(left=1e-2)
+    axes.set(xlabel="residual [px]", ylabel="share below", ylim=(0, 1.02))
+    if axes.lines:
+        axes.legend(loc="upper left")
+    return figure
+
+
+@_styled
+def plot_convergence(iterations: Sequence[Iteration]) -> Figure:
+    """Cost of every term, and the error against the survey as it falls, over the iterations."""
+    tags = ("error/corner_m", "error/corner_relative_m", "error/lane_lateral_m")
+    tags = tuple(t for t in tags if any(t in i.errors for i in iterations))
+    figure, panels = _figure(2 if tags else 1, width=9.0, height=2.9)
+    number = [i.number for i in iterations]
+    terms = list(dict.fromkeys(term for i in iterations for term in i.cost))
+    axes = panels[0]
+    axes.plot(number, [i.total for i in iterations], color=INK, lw=1.8, label="total")
+    for term, color in zip(terms, SERIES * 9, strict=False):
+        axes.plot(number, [i.cost.get(term, math.nan) for i in iterations], color=color, label=term)
+    if any(cost > 0 for i in iterations for cost in i.cost.values()):
+        axes.set_yscale("log")
+    axes.set(xlabel="iteration", ylabel="cost", title="cost")
+    axes.legend(loc="best")
+    for tag, color in zip(tags, SERIES, strict=False):
+        points = [(i.number, i.errors[tag]) for i in iterations if tag in i.errors]
+        name = tag.removeprefix("error/").removesuffix("_m").replace("_", " ")
+        panels[1].plot(*zip(*points, strict=True), color=color, marker=".", label=name)
+    if tags:
+        panels[1].set(xlabel="iteration", ylabel="error [m]", title="error against the survey")
+        panels[1].set_ylim(bottom=0)
+        panels[1].legend(loc="upper right")
+    return figure
+
+
+def svg(figure: Figure) -> str:
+    """A figure as an SVG element that can stand inside HTML."""
+    buffer = io.StringIO()
+    with mpl.rc_context(_STYLE):
+        figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def pixels(figure: Figure) -> UInt8[np.ndarray, "h w 3"]:
+    """A figure as an image."""
+    canvas = FigureCanvasAgg(figure)
+    with mpl.rc_context(_STYLE):
+        canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _figure(panels: int, *, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, [figure.add_subplot(1, panels, k + 1) for k in range(panels)]
+
+
+def _draw_lines(
+    axes: Axes, point_world: Tensor, line: Tensor, color: str, *, width: float, alpha: float
+) -> None:
+    """Lines from above, in one collection."""
+    _, count = torch.unique_consecutive(line.cpu(), return_counts=True)
+    pieces = point_world[:, :2].cpu().numpy()
+    parts = np.split(pieces, count.cumsum(0).numpy()[:-1]) if len(pieces) else []
+    axes.add_collection(LineCollection(parts, colors=color, linewidths=width, alpha=alpha))
+    axes.autoscale_view()

@@ -1,0 +1,47 @@
+"""Progress on the terminal: one line that is rewritten where there is a terminal, plain lines where there is none."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TextIO
+
+
+class Progress:
+    """Says which stage runs, how far it is, and when it will be done; keeps each stage's seconds."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self.seconds: dict[str, float] = {}
+        self._stream = sys.stderr if stream is None else stream
+        self._rewrites = self._stream.isatty()
+        self._stage = ""
+        self._started = time.monotonic()
+
+    def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
+        """Tell that `done` of `total` steps of a stage are finished; a new name starts a new stage."""
+        now = time.monotonic()
+        if stage != self._stage:
+            self.finish()
+            self._stage, self._started = stage, now
+        elapsed = now - self._started
+        self.seconds[stage] = elapsed
+        text = stage if not total else f"{stage} {done}/{total}"
+        if done and done < total:
+            text += f", {elapsed * (total - done) / done:.0f} s left"
+        if note:
+            text += f", {note}"
+        if self._rewrites:
+            self._stream.write(f"\r\x1b[K{text}")
+        elif not total or done == total or note:
+            self._stream.write(f"{text}\n")
+        self._stream.flush()
+
+    def finish(self) -> None:
+        """End the stage that runs, and its line."""
+        if not self._stage:
+            return
+        self.seconds[self._stage] = time.monotonic() - self._started
+        if self._rewrites:
+            self._stream.write(f"\r\x1b[K{self._stage}: {self.seconds[self._stage]:.1f} s\n")
+            self._stream.flush()
+        self._stage = ""

@@ -1,0 +1,110 @@
+"""The event files that TensorBoard shows while a map is being adjusted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from torch import Tensor
+from torch.utils.tensorboard.writer import SummaryWriter
+
+from crowdmap_torch.evaluate import MapFigures
+from crowdmap_torch.report import plots
+from crowdmap_torch.report.record import Iteration
+from crowdmap_torch.tables import HdMap, Survey
+
+_MAX_SAMPLES = 200_000
+"""Histograms are made of an even selection of at most this many numbers."""
+
+
+class TensorBoardLog:
+    """Writes one run's numbers by tags that are paths; a context manager that closes the file."""
+
+    def __init__(self, folder: Path) -> None:
+        self._writer = SummaryWriter(str(folder), flush_secs=10)
+
+    def __enter__(self) -> TensorBoardLog:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Write what is buffered and close the event file."""
+        self._writer.close()
+
+    def log_config(self, config_yaml: str) -> None:
+        """The configuration as text."""
+        # Four blanks make Markdown show it as it is.
+        self._writer.add_text("config", "\n".join(f"    {s}" for s in config_yaml.splitlines()))
+
+    def log_iteration(
+        self, iteration: Iteration, *, down_weighted: Mapping[str, float] | None = None
+    ) -> None:
+        """Cost of every term, damping, step, gain ratio and errors.
+
+        `down_weighted` is the share of each term's observations that its robust kernel gives less
+        than half its weight.
+        """
+        step = iteration.number
+        scalars = {f"cost/{term}": cost for term, cost in iteration.cost.items()}
+        scalars |= {
+            "cost/total": iteration.total,
+            "solver/damping": iteration.damping,
+            "solver/step_norm": iteration.step_norm,
+            "solver/gain_ratio": iteration.gain_ratio,
+            "solver/accepted": float(iteration.accepted),
+        }
+        scalars |= {f"robust/down_weighted_{k}": v for k, v in (down_weighted or {}).items()}
+        self.log_scalars({**scalars, **iteration.errors}, step)
+
+    def log_scalars(self, scalars: Mapping[str, float], step: int) -> None:
+        """Numbers by tag; what is not finite is left out, as TensorBoard cannot draw it."""
+        for tag, value in scalars.items():
+            if math.isfinite(value):
+                self._writer.add_scalar(tag, value, step)
+
+    def log_histogram(self, tag: str, values: Float[Tensor, ...], step: int) -> None:
+        """The distribution of residuals or weights; what is not finite is left out."""
+        flat = values.detach().reshape(-1)
+        flat = flat[flat.isfinite()]
+        if len(flat) == 0:
+            return
+        flat = flat[:: max(len(flat) // _MAX_SAMPLES, 1)]
+        self._writer.add_histogram(tag, flat.to(torch.float64).cpu().numpy(), step)
+
+    def log_figures(self, figures: MapFigures, step: int, *, prefix: str = "survey") -> None:
+        """The headline figures against the survey."""
+        signs = figures.signs
+        scalars = {
+            "absolute_corner_m": signs.absolute.total.mean,
+            "relative_corner_m": signs.relative.total.mean,
+            "absolute_center_m": signs.absolute_center.total.mean,
+            "absolute_over_oracle": figures.absolute_over_oracle,
+            "sign_recall": signs.recall,
+            "sign_precision": signs.precision,
+        }
+        if figures.lanes is not None:
+            scalars["lane_recall"] = figures.lanes.recall
+            scalars["lane_precision"] = figures.lanes.precision
+            scalars["lane_lateral_m"] = figures.lanes.lateral.mean
+        self.log_scalars({f"{prefix}/{name}": value for name, value in scalars.items()}, step)
+
+    def log_map(self, tag: str, hd_map: HdMap, survey: Survey | None, step: int) -> None:
+        """The map from above, with the survey under it."""
+        self.log_figure(tag, plots.plot_map(hd_map, survey), step)
+
+    def log_figure(self, tag: str, figure: Figure, step: int) -> None:
+        """A figure as an image."""
+        # By its pixels: SummaryWriter.add_figure would need pyplot, which keeps every figure alive.
+        self._writer.add_image(tag, plots.pixels(figure), step, dataformats="HWC")

@@ -1,0 +1,97 @@
+"""What is watched while bundle adjustment runs: costs, solver, residuals, errors against the survey, the map from above."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch.bundle import Bundle
+from crowdmap_torch.evaluate import progress_scalars
+from crowdmap_torch.optim.levenberg_marquardt import LmState
+from crowdmap_torch.optim.linearize import residuals
+from crowdmap_torch.report.record import Iteration
+from crowdmap_torch.report.tensorboard import TensorBoardLog
+from crowdmap_torch.stages import adjust
+from crowdmap_torch.tables import HdMap, Lanes, Signs, Survey
+
+_LANES_EVERY = 5
+"""Lanes are compared with the survey every this many steps: it takes longer than a step."""
+
+
+class Watch:
+    """Logs every step of the adjustment to TensorBoard, and keeps them for the report."""
+
+    def __init__(
+        self,
+        log: TensorBoardLog,
+        survey: Survey | None,
+        signs: Signs,
+        lanes: Lanes,
+        *,
+        every: int = 1,
+    ) -> None:
+        self.iterations: list[Iteration] = []
+        self.residual_px: dict[str, Float[Tensor, " n"]] = {}
+        self._log = log
+        self._survey = survey
+        self._signs = signs
+        self._lanes = lanes
+        self._every = max(every, 1)
+
+    @torch.no_grad()
+    def start(self, bundle: Bundle, map_before: HdMap) -> None:
+        """The map of the cluster heads and its residuals, before the first step."""
+        self._log.log_map("map/before", map_before, self._survey, 0)
+        self.residual_px["cluster heads"] = pixel_residuals(bundle)
+        errors = self._errors(bundle, with_lanes=True)
+        self._log.log_scalars(errors, 0)
+
+    @torch.no_grad()
+    def step(self, number: int, state: LmState, bundle: Bundle) -> None:
+        """One step of the solver."""
+        looked_at = number % self._every == 0
+        iteration = Iteration(
+            number=number + 1,
+            cost={name: float(cost) for name, cost in state.term_cost.items()},
+            damping=float(state.damping),
+            gain_ratio=float(state.gain_ratio),
+            step_norm=float(state.step_norm),
+            accepted=bool(state.accepted),
+            errors=self._errors(bundle, with_lanes=number % _LANES_EVERY == 0) if looked_at else {},
+        )
+        self.iterations.append(iteration)
+        if not looked_at:
+            self._log.log_iteration(iteration)
+            return
+        values = bundle.values()
+        down_weighted = {}
+        for name, term in bundle.problem().terms.items():
+            squared = residuals(term, values).square().sum(-1)
+            weight = term.loss.weight(squared)
+            down_weighted[name] = float((weight < 0.5).to(weight).mean()) if len(weight) else 0.0
+            self._log.log_histogram(f"residual/{name}", squared.sqrt(), number + 1)
+            self._log.log_histogram(f"weight/{name}", weight, number + 1)
+        self._log.log_iteration(iteration, down_weighted=down_weighted)
+        scales = dict(zip(("sign", "lane"), bundle.scale.tolist(), strict=True))
+        self._log.log_scalars({f"scale/{k}_px": v for k, v in scales.items()}, number + 1)
+
+    @torch.no_grad()
+    def finish(self, bundle: Bundle, hd_map: HdMap) -> None:
+        """The adjusted map and its residuals."""
+        self._log.log_map("map/after", hd_map, self._survey, len(self.iterations))
+        self.residual_px["adjusted map"] = pixel_residuals(bundle)
+
+    def _errors(self, bundle: Bundle, *, with_lanes: bool) -> dict[str, float]:
+        if self._survey is None or not len(self._signs):
+            return {}
+        signs, lanes, _ = adjust.read_map(bundle, self._signs, self._lanes, covariance=False)
+        return progress_scalars(signs, self._survey, lanes=lanes if with_lanes else None)
+
+
+def pixel_residuals(bundle: Bundle) -> Float[Tensor, " m"]:
+    """Length of every sign corner's reprojection error [px]."""
+    term = bundle.problem().terms.get("sign_reprojection")
+    if term is None or not len(term):
+        return bundle.scale.new_zeros(0)
+    return residuals(term, bundle.values()).norm(dim=-1) * bundle.scale[0]

@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from small_world import Builder
+
+from crowdmap_torch.evaluate import compare_map_signs, evaluate_map
+from crowdmap_torch.report.record import (
+    Iteration,
+    JourneySummary,
+    Pruned,
+    RunRecord,
+    Spectrum,
+)
+from crowdmap_torch.tables import RejectedJourney
+
+
+@pytest.fixture(scope="session")
+def build() -> Builder:
+    """What makes tables from a few numbers."""
+    return Builder()
+
+
+@pytest.fixture(scope="session")
+def record(build: Builder) -> RunRecord:
+    """A run with something in every part of the report."""
+    k = torch.arange(9, dtype=torch.float64)
+    true = build.signs(
+        torch.stack((12 * k, 4 * (-1) ** k, 2 + 0.1 * k), dim=-1), shape=k.long() % 6
+    )
+    lines = [build.straight(y) for y in (0.0, 3.5)]
+    survey = build.survey(true, lines)
+    generator = torch.Generator().manual_seed(3)
+
+    def noisy(sigma: float):
+        noise = sigma * torch.randn(9, 3, generator=generator, dtype=torch.float64)
+        return build.hd_map(build.moved(true, noise), build.lanes(lines), shared=0.05)
+
+    hd_map, before = noisy(0.05), noisy(0.2)
+    iterations = tuple(
+        Iteration(
+            number=n,
+            cost={"sign_reprojection": 100.0 / (n + 1), "pose_absolute": 3.0 + n},
+            damping=1e-4,
+            gain_ratio=0.9,
+            step_norm=1.0 / (n + 1),
+            errors={"error/corner_m": 0.2 / (n + 1)},
+        )
+        for n in range(5)
+    )
+    return RunRecord(
+        title="a street <of> tests",
+        subtitle="version & date",
+        hd_map=hd_map,
+        map_before=before,
+        survey=survey,
+        figures=evaluate_map(hd_map, survey),
+        figures_before=evaluate_map(before, survey),
+        comparison=compare_map_signs(hd_map, survey),
+        comparison_before=compare_map_signs(before, survey),
+        paths_world={"a": build.straight(1.5), "b": build.straight(1.8)},
+        journeys=(
+            JourneySummary("a", 100, 50, 48, 9, (0.3, -0.2, 0.5), 0.1, (0.31, -0.2, 0.4)),
+            JourneySummary("b", 90, 40, 40, 9, (-0.3, 0.2, -0.5)),
+        ),
+        counts={"sign detections": 90, "eigenvalue gap": 0.61, "method": "ours"},
+        pruned=(Pruned("signs", "too little parallax", 3), Pruned("signs", "too short", 12)),
+        rejected=(RejectedJourney("c", "poses.parquet: row 3: x is NaN"),),
+        suspects=(RejectedJourney("d", "its bias of 9.8 m does not fit the others"),),
+        spectra=(Spectrum("signs, round 2", (0.0, 0.01, 0.02, 0.7, 0.8), 3),),
+        residual_px={"triangulated": torch.rand(200, generator=generator) + 0.1},
+        iterations=iterations,
+        outcome="converged: the cost no longer falls",
+        timings_s={"read": 1.0, "adjust": 4.0},
+        config_yaml="clustering:\n  sign_scales_m: [4.0, 1.0]\n",
+    )

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import matplotlib as mpl
+import pytest
+import torch
+from matplotlib._pylab_helpers import Gcf
+
+from crowdmap_torch.evaluation.signs import compare_signs
+from crowdmap_torch.report import plots
+from crowdmap_torch.report.record import Iteration, JourneySummary, RunRecord, Spectrum
+
+
+def every_plot(record: RunRecord):
+    assert record.comparison is not None
+    return [
+        plots.plot_map(record.hd_map, record.survey),
+        plots.plot_sign_errors(record.comparison, record.comparison_before, oracle_m=0.1),
+        plots.plot_bias(record.journeys),
+        plots.plot_spectrum(record.spectra),
+        plots.plot_residuals(record.residual_px),
+        plots.plot_convergence(record.iterations),
+    ]
+
+
+def test_every_plot_can_be_an_svg_and_an_image(record):
+    for figure in every_plot(record):
+        assert plots.svg(figure).startswith("<svg")
+        image = plots.pixels(figure)
+        assert image.ndim == 3
+        assert image.shape[2] == 3
+        assert image.std() > 0
+
+
+def test_drawing_leaves_no_global_state(record):
+    before = dict(mpl.rcParams)
+    every_plot(record)
+    assert dict(mpl.rcParams) == before
+    assert Gcf.get_all_fig_managers() == []
+
+
+@pytest.mark.parametrize("residual", [torch.zeros(0), torch.full((3,), torch.nan), torch.zeros(5)])
+def test_nothing_to_draw_is_drawn(build, record, residual):
+    nothing = build.hd_map(build.signs(torch.zeros(0, 3, dtype=torch.float64)))
+    figures = [
+        plots.plot_map(nothing),
+        plots.plot_residuals({"a": residual}),
+        plots.plot_convergence([Iteration(0, {"a": 0.0}, 1.0, 0.0, 0.0)]),
+        plots.plot_spectrum([Spectrum("one", (0.0,), 1), Spectrum("none", (), 0)]),
+        plots.plot_bias([JourneySummary("a", 0, 0, 0, 0, (0.0, 0.0, 0.0))]),
+    ]
+    for figure in figures:
+        assert plots.svg(figure)
+
+
+def test_errors_are_of_centres_where_no_corners_were_surveyed(build):
+    true = build.signs([[0.0, 0, 2], [40, 0, 2], [80, 0, 2]])
+    survey = build.survey_signs(true)
+    one_center = survey.corners_world.clone()
+    one_center[1] = torch.nan
+    comparison = compare_signs(
+        build.moved(true, (0.3, 0, 0)), replace(survey, corners_world=one_center)
+    )
+    assert plots.sign_errors(comparison, "absolute").tolist() == pytest.approx([0.3] * 3)
+    assert plots.sign_errors(comparison, "relative").max() < 1e-9
