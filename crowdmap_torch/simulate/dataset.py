@@ -1,0 +1,211 @@
+"""A whole simulated dataset: one world, one fleet, many journeys, and the truth about all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from crowdmap_torch.io.atomic import atomic_folder
+from crowdmap_torch.io.documents import write_json
+from crowdmap_torch.simulate import faults, files, lane_perception, sign_detections
+from crowdmap_torch.simulate.lane_perception import LaneDetectionConfig, LaneRows, detect_lanes
+from crowdmap_torch.simulate.positioning import (
+    PositioningConfig,
+    measured_poses,
+    pose_errors,
+    reported_sigmas,
+)
+from crowdmap_torch.simulate.rigs import RigConfig, SimulatedRig, build_rig
+from crowdmap_torch.simulate.sign_detections import SignDetectionConfig, SignRows
+from crowdmap_torch.simulate.sign_perception import detect_signs
+from crowdmap_torch.simulate.vehicle import Drive, VehicleConfig, drive_through
+from crowdmap_torch.simulate.worlds import PRESETS, World, WorldConfig, build_world
+
+_WORLD, _RIG, _JOURNEY, _FAULTS = range(4)
+"""Streams of random numbers: what one of them draws does not depend on how much the others did."""
+_FIRST_START = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
+DETECTION_PRESETS = {
+    "day": (sign_detections.DAY, lane_perception.DAY),
+    "night": (sign_detections.NIGHT, lane_perception.NIGHT),
+}
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """Everything that decides a dataset; the same configuration gives the same bytes."""
+
+    world: WorldConfig = field(default_factory=lambda: PRESETS["suburb"])
+    vehicle: VehicleConfig = field(default_factory=VehicleConfig)
+    rig: RigConfig = field(default_factory=RigConfig)
+    positioning: PositioningConfig = field(default_factory=PositioningConfig)
+    signs: SignDetectionConfig = field(default_factory=SignDetectionConfig)
+    lanes: LaneDetectionConfig = field(default_factory=LaneDetectionConfig)
+    journeys: int = 25
+    seed: int = 0
+    world_seed: int | None = None
+    """Seed of the world alone, `seed` if not given: other journeys in the same world."""
+    bad_drives: tuple[str, ...] = ()
+    """One journey is spoilt for each of these `faults.KINDS`."""
+
+    def __post_init__(self) -> None:
+        if self.journeys < 1 or self.rig.rigs < 1:
+            raise ValueError(
+                f"{self.journeys} journeys with {self.rig.rigs} rigs: expected at least one of each"
+            )
+
+
+@dataclass(frozen=True)
+class SimulatedJourney:
+    """One journey as it was, and as its files tell it."""
+
+    journey_id: str
+    rig: SimulatedRig
+    drive: Drive
+    started: datetime
+    T_world_link: Float[np.ndarray, "f 4 4"]
+    """True poses of the pose link."""
+    T_reported: Float[np.ndarray, "f 4 4"]
+    signs: SignRows
+    lanes: LaneRows
+    fault: str | None
+
+
+def make_world(config: SimulationConfig) -> World:
+    """The world of a dataset."""
+    seed = config.seed if config.world_seed is None else config.world_seed
+    return build_world(config.world, np.random.default_rng([seed, _WORLD]))
+
+
+def make_fleet(config: SimulationConfig) -> tuple[SimulatedRig, ...]:
+    """The rigs that the journeys use in turn."""
+    return tuple(
+        build_rig(config.rig, index, np.random.default_rng([config.seed, _RIG, index]))
+        for index in range(config.rig.rigs)
+    )
+
+
+def make_journey(
+    config: SimulationConfig,
+    world: World,
+    fleet: tuple[SimulatedRig, ...],
+    index: int,
+    fault: str | None = None,
+) -> SimulatedJourney:
+    """The `index`-th journey; it does not depend on how many there are."""
+    rng = np.random.default_rng([config.seed, _JOURNEY, index])
+    drive_rng, pose_rng, sign_rng, lane_rng, fault_rng = rng.spawn(5)
+    rig = fleet[index % len(fleet)]
+    # With both directions the rigs take turns in pairs, so that each rig drives both ways.
+    direction = 1
+    if config.world.both_directions:
+        direction = 1 if index % 2 == 0 else -1
+        rig = fleet[index // 2 % len(fleet)]
+    drive = drive_through(world, rig, config.vehicle, drive_rng, direction=direction)
+    T_world_link = _link_poses(drive, rig)
+    T_reported = measured_poses(
+        T_world_link, pose_errors(drive.distance, config.positioning, pose_rng)
+    )
+    seen_from, camera = faults.with_sensor_fault(drive, rig.camera, fault, fault_rng)
+    claimed = faults.with_upload_fault(world.signs, fault, fault_rng)
+    rate = config.vehicle.frame_rate_hz
+    return SimulatedJourney(
+        journey_id=_journey_id(index),
+        rig=rig,
+        drive=drive,
+        started=_FIRST_START + timedelta(hours=19 * index),
+        T_world_link=T_world_link,
+        T_reported=faults.with_pose_fault(T_reported, drive, fault, fault_rng),
+        signs=detect_signs(claimed, seen_from, camera, config.signs, sign_rng, frame_rate_hz=rate),
+        lanes=detect_lanes(world, seen_from, camera, config.lanes, lane_rng, frame_rate_hz=rate),
+        fault=fault,
+    )
+
+
+def write_dataset(
+    config: SimulationConfig,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    on_journey: Callable[[int], None] = lambda _: None,
+) -> World:
+    """Simulates and writes a dataset with its survey; `on_journey` is called after each journey."""
+    if out.exists():
+        if not overwrite:
+            raise ValueError(f"{out} exists already; choose another folder or pass --overwrite")
+        if not out.is_dir() or (any(out.iterdir()) and not (out / "dataset.json").exists()):
+            raise ValueError(f"{out} is no dataset (it has no dataset.json); it is left alone")
+    world, fleet = make_world(config), make_fleet(config)
+    rng = np.random.default_rng([config.seed, _FAULTS])
+    fault_of = faults.spread_faults(config.bad_drives, config.journeys, rng)
+    settings = {"generator": "crowdmap_torch.simulate", "settings": asdict(config)}
+    with atomic_folder(out) as folder:
+        write_json(
+            folder / "dataset.json",
+            {"format": "crowdmap-dataset", "version": 1, "origin": files.ORIGIN},
+        )
+        for rig in fleet:
+            files.write_rig(folder / "rigs" / rig.rig_id, rig)
+        for index in range(config.journeys):
+            journey = make_journey(config, world, fleet, index, fault_of[index])
+            _write_journey(config, folder, world, journey)
+            on_journey(index)
+        files.write_survey(folder / "survey", world, settings)
+        write_json(
+            folder / "survey" / "truth" / "bad_drives.json",
+            {_journey_id(k): fault for k, fault in enumerate(fault_of) if fault is not None},
+        )
+    return world
+
+
+def _write_journey(
+    config: SimulationConfig, out: Path, world: World, journey: SimulatedJourney
+) -> None:
+    folder = out / "journeys" / journey.journey_id
+    started_ns = round(journey.started.timestamp()) * 10**9
+    write_json(
+        folder / "journey.json",
+        {
+            "format": "crowdmap-journey",
+            "version": 1,
+            "journey_id": journey.journey_id,
+            "rig": journey.rig.rig_id,
+            "vehicle_id": f"vehicle-{journey.rig.rig_id[-1]}",
+            "started_at": journey.started.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        },
+    )
+    files.write_poses(
+        folder / "poses.parquet",
+        journey.drive,
+        journey.T_reported,
+        started_ns,
+        reported_sigmas(config.positioning),
+    )
+    files.write_sign_rows(folder / "signs.parquet", journey.signs, journey.drive)
+    files.write_lane_rows(folder / "lanes.parquet", journey.lanes, journey.drive)
+    files.write_truth(
+        out / "survey" / "truth" / journey.journey_id,
+        world,
+        journey.drive,
+        journey.T_world_link,
+        started_ns,
+        journey.signs,
+        journey.lanes,
+    )
+
+
+def _journey_id(index: int) -> str:
+    return f"journey-{index:03d}"
+
+
+def _link_poses(drive: Drive, rig: SimulatedRig) -> Float[np.ndarray, "f 4 4"]:
+    """Poses of the link that the positioning module reports: the body is rigid."""
+    T_world_camera = np.zeros((len(drive), 4, 4))
+    T_world_camera[:, :3, :3] = drive.R_world_camera
+    T_world_camera[:, :3, 3] = drive.p_world_camera
+    T_world_camera[:, 3, 3] = 1.0
+    return T_world_camera @ np.linalg.inv(rig.T_link_camera)

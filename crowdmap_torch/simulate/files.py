@@ -1,0 +1,192 @@
+"""Simulated journeys, rigs and the exact survey in FORMAT.md's form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import torch
+from jaxtyping import Float
+
+from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io import poses
+from crowdmap_torch.io.documents import write_json
+from crowdmap_torch.io.writing import (
+    list_column,
+    name_column,
+    points_column,
+    row_column,
+    write_parquet,
+)
+from crowdmap_torch.simulate.lane_perception import TYPES, LaneRows
+from crowdmap_torch.simulate.rigs import SimulatedRig, rig_yaml
+from crowdmap_torch.simulate.sign_detections import SignRows, all_codes
+from crowdmap_torch.simulate.vehicle import Drive
+from crowdmap_torch.simulate.worlds import World
+
+ORIGIN = {"lat_deg": 32.9, "lon_deg": -117.2, "height_m": 120.0}
+_CORNERS = polygon.CORNER_COUNT.numpy()
+
+
+def write_rig(folder: Path, rig: SimulatedRig) -> None:
+    """`rig.yaml` and, for a rig with a mount, `rig.urdf`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "rig.yaml").write_text(rig_yaml(rig), encoding="utf-8")
+    if rig.urdf is not None:
+        (folder / "rig.urdf").write_text(rig.urdf, encoding="utf-8")
+
+
+def write_poses(
+    path: Path,
+    drive: Drive,
+    T_world_link: Float[np.ndarray, "f 4 4"],
+    started_ns: int,
+    sigmas: tuple[Float[np.ndarray, " 3"], float] | None = None,
+) -> None:
+    """`poses.parquet`, with or without the module's own sigmas."""
+    frames = len(drive)
+    sigma_position = sigma_rotation = None
+    if sigmas is not None:
+        sigma_position = torch.from_numpy(sigmas[0]).expand(frames, 3)
+        sigma_rotation = torch.full((frames,), sigmas[1], dtype=torch.float64)
+    poses.write_poses(
+        path,
+        poses.LinkPoses(
+            frame_number=torch.from_numpy(drive.frame),
+            t_ns=torch.from_numpy(started_ns + np.rint(drive.t * 1e9).astype(np.int64)),
+            T_world_link=torch.from_numpy(T_world_link),
+            sigma_position=sigma_position,
+            sigma_rotation=sigma_rotation,
+        ),
+    )
+
+
+def write_sign_rows(path: Path, rows: SignRows, drive: Drive) -> None:
+    """`signs.parquet` of a journey."""
+    count = _CORNERS[rows.shape]
+    slots = np.arange(8)[None] < count[:, None]
+    _write(
+        path,
+        {
+            "frame": drive.frame[rows.frame],
+            "shape": name_column(rows.shape, polygon.SHAPES),
+            "u": list_column(rows.corners_px[..., 0][slots], count, pa.float32()),
+            "v": list_column(rows.corners_px[..., 1][slots], count, pa.float32()),
+            "type": name_column(rows.code, all_codes()),
+            "score": pa.array(rows.score.astype(np.float32)),
+            "track": pa.array(rows.track, mask=rows.track < 0),
+        },
+    )
+
+
+def write_lane_rows(path: Path, rows: LaneRows, drive: Drive) -> None:
+    """`lanes.parquet` of a journey."""
+    _write(
+        path,
+        {
+            "frame": drive.frame[rows.frame],
+            "u": list_column(rows.px[:, 0], rows.count, pa.float32()),
+            "v": list_column(rows.px[:, 1], rows.count, pa.float32()),
+            "type": name_column(rows.type, TYPES),
+            "score": pa.array(rows.score.astype(np.float32)),
+        },
+    )
+
+
+def write_truth(
+    folder: Path,
+    world: World,
+    drive: Drive,
+    T_world_link: Float[np.ndarray, "f 4 4"],
+    started_ns: int,
+    signs: SignRows,
+    lanes: LaneRows,
+) -> None:
+    """What scorers may know of a journey: true poses, what each row shows, the road below."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_poses(folder / "poses.parquet", drive, T_world_link, started_ns)
+    _write(
+        folder / "signs.parquet",
+        {
+            "row": np.arange(len(signs)),
+            "sign_id": name_column(signs.sign, world.signs.sign_id),
+            "outlier": signs.is_outlier,
+        },
+    )
+    _write(
+        folder / "lanes.parquet",
+        {
+            "row": np.arange(len(lanes)),
+            "lane_id": name_column(lanes.marker, world.markers.lane_id),
+            "merged": lanes.is_merged,
+        },
+    )
+    normal = drive.road_normal_camera
+    _write(
+        folder / "road.parquet",
+        {
+            "frame": drive.frame,
+            **{f"n{axis}": normal[:, k] for k, axis in enumerate("xyz")},
+            "height_m": drive.camera_height,
+        },
+    )
+
+
+def write_survey(folder: Path, world: World, provenance: dict) -> None:
+    """The exact map: every sign and marker of the world, whether anybody drove past it or not."""
+    write_json(
+        folder / "map.json",
+        {
+            "format": "crowdmap-map",
+            "version": 1,
+            "origin": ORIGIN,
+            "shared_covariance": [0.0] * 9,
+            "provenance": provenance,
+        },
+    )
+    signs = world.signs
+    count = _CORNERS[signs.shape]
+    corners = signs.corners()[np.arange(8)[None] < count[:, None]]
+    _write(
+        folder / "signs.parquet",
+        {
+            "sign_id": pa.array(signs.sign_id, pa.string()),
+            "shape": name_column(signs.shape, polygon.SHAPES),
+            "type": pa.array(signs.code, pa.string()),
+            "corners": points_column(corners, count),
+            "center": row_column(signs.center),
+            "normal": row_column(signs.normal),
+            "width_m": signs.size[:, 0],
+            "height_m": signs.size[:, 1],
+            "sigma_m": np.full(len(signs), 1e-3),
+        },
+    )
+    markers = world.markers
+    points = []
+    for marker in range(len(markers)):
+        # Every other point: half a metre apart; the last one closes the marker.
+        thinned = markers.points_of(marker)
+        keep = np.arange(len(thinned)) % 2 == 0
+        keep[-1] = True
+        thinned = thinned[keep]
+        points.append(thinned[::-1] if markers.is_oncoming[marker] else thinned)
+    _write(
+        folder / "lanes.parquet",
+        {
+            "lane_id": pa.array(markers.lane_id, pa.string()),
+            "type": pa.array(markers.type, pa.string()),
+            "points": points_column(
+                np.concatenate(points) if points else np.zeros((0, 3)),
+                np.array([len(p) for p in points], dtype=np.int64),
+            ),
+            "sigma_m": np.full(len(markers), 1e-3),
+        },
+    )
+
+
+def _write(path: Path, columns: dict[str, pa.Array | np.ndarray]) -> None:
+    write_parquet(
+        path,
+        {k: pa.array(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()},
+    )

@@ -1,0 +1,113 @@
+"""What a sign detector sees and gets wrong, and the table of what it reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from crowdmap_torch.simulate.signposts import CODES, PANEL_CODES
+
+
+@dataclass(frozen=True)
+class SignDetectionConfig:
+    """What the sign detector sees and what it gets wrong."""
+
+    range_m: tuple[float, float] = (12.0, 80.0)
+    """Nearest and farthest depth of a sign that is detected; with the `paper` positioning and a
+    nearest depth of 12 m a plain average of 25 journeys has the paper's errors (8 m: a fifth less)."""
+    min_box_px: float = 12.0
+    """Smallest larger side of a sign's box."""
+    view_angle_deg: float = 75.0
+    """Largest angle between a sign's normal and the ray to it."""
+    pixel_noise_px: float = 0.55
+    """1-sigma of each corner in u and in v, for a large box."""
+    small_box_px: float = 12.0
+    """Box at which the noise is 1.41 times as large: `noise * sqrt(1 + (small_box / box)^2)`."""
+    common_noise_px: float = 0.0
+    """1-sigma of a shift that all corners of a detection share."""
+    missed: float = 0.06
+    """Share of single detections that are missing."""
+    occlusions: float = 0.15
+    """Probability that a sign is hidden for a while in a journey."""
+    occlusion_s: tuple[float, float] = (0.3, 1.5)
+    outliers: float = 0.01
+    """Share of detections with one or all corners far off."""
+    outlier_px: tuple[float, float] = (5.0, 40.0)
+    wrong_shape: float = 0.01
+    duplicates: float = 0.005
+    """Share of detections that come twice in their frame."""
+    ghosts_per_frame: float = 0.02
+    """False detections of a single frame."""
+    ghost_runs_per_frame: float = 0.002
+    """False detections that last 3 to 8 frames and move through the image."""
+    vehicle_signs_per_frame: float = 0.0002
+    """Signs on the back of vehicles ahead: they stand still in the image for seconds."""
+    wrong_code: float = 0.02
+    null_code: float = 0.1
+    """Share of the detections whose code was not read."""
+    track_switches: float = 0.005
+    """Probability per detection that a track number changes without need."""
+    track_errors: float = 0.01
+    """Share of the detections that carry another sign's track number."""
+    null_track: float = 0.03
+
+
+DAY = SignDetectionConfig()
+NIGHT = replace(
+    DAY,
+    missed=0.35,
+    pixel_noise_px=0.85,
+    outliers=0.03,
+    wrong_shape=0.025,
+    ghosts_per_frame=0.04,
+    ghost_runs_per_frame=0.004,
+    null_code=0.3,
+    track_switches=0.02,
+    track_errors=0.02,
+)
+
+
+@dataclass(frozen=True)
+class SignRows:
+    """Detections of one journey, and what they truly show."""
+
+    frame: Int[np.ndarray, " d"]
+    """Index into the drive's frames."""
+    shape: Int[np.ndarray, " d"]
+    corners_px: Float[np.ndarray, "d 8 2"]
+    """The first corners of a row count, as many as its shape has."""
+    code: Int[np.ndarray, " d"]
+    """Index into `all_codes()`; -1 null."""
+    score: Float[np.ndarray, " d"]
+    track: Int[np.ndarray, " d"]
+    """-1 null."""
+    sign: Int[np.ndarray, " d"]
+    """The sign that it shows; -1 for a false detection."""
+    is_outlier: Bool[np.ndarray, " d"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, index: np.ndarray) -> SignRows:
+        """The rows at `index`."""
+        return SignRows(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+def all_codes() -> tuple[str, ...]:
+    """Every traffic-sign code that a detector knows."""
+    return tuple(dict.fromkeys([*(c for codes in CODES.values() for c in codes), *PANEL_CODES]))
+
+
+def corner_sigma(
+    box_px: Float[np.ndarray, " d"], config: SignDetectionConfig
+) -> Float[np.ndarray, " d"]:
+    """1-sigma of each corner's noise [px] of boxes of this size."""
+    return config.pixel_noise_px * np.sqrt(1 + (config.small_box_px / box_px) ** 2)
+
+
+def concatenate(tables: tuple[SignRows, ...]) -> SignRows:
+    """One table with the rows of all, in order."""
+    columns = (np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(SignRows))
+    return SignRows(*columns)

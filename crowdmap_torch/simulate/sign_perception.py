@@ -1,0 +1,181 @@
+"""The perception module's sign detections: exact corners, then noise and every kind of fault."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+
+from crowdmap_torch.geometry import polygon
+from crowdmap_torch.geometry.camera import Camera, project
+from crowdmap_torch.simulate.sign_detections import (
+    SignDetectionConfig,
+    SignRows,
+    all_codes,
+    concatenate,
+    corner_sigma,
+)
+from crowdmap_torch.simulate.sign_faults import ghosts, with_outliers, with_wrong_shapes
+from crowdmap_torch.simulate.signposts import WorldSigns
+from crowdmap_torch.simulate.vehicle import Drive
+
+_CORNERS = polygon.CORNER_COUNT.numpy()
+_CHUNK_FRAMES = 4000
+"""Frames looked at in one go; bounds the memory of endless drives."""
+
+
+def detect_signs(
+    signs: WorldSigns,
+    drive: Drive,
+    camera: Camera,
+    config: SignDetectionConfig,
+    rng: np.random.Generator,
+    *,
+    frame_rate_hz: float,
+) -> SignRows:
+    """All sign detections of a drive, frame after frame, in random order within a frame."""
+    frame, sign, corners = _visible(signs, drive, camera, config)
+    kept = rng.random(len(frame)) >= config.missed
+    kept &= ~_is_hidden(frame, sign, len(signs), config, rng, frame_rate_hz)
+    frame, sign, corners = frame[kept], sign[kept], corners[kept]
+    twice = rng.random(len(frame)) < config.duplicates
+    track = _tracks(frame, sign, config, rng)
+    frame = np.concatenate((frame, frame[twice]))
+    sign = np.concatenate((sign, sign[twice]))
+    corners = np.concatenate((corners, corners[twice]))
+    track = np.concatenate((track, np.full(int(twice.sum()), -1)))
+    is_second = np.arange(len(frame)) >= len(twice)
+
+    shape = signs.shape[sign]
+    box = _boxes(corners)
+    sigma = corner_sigma(box.max(-1), config) * np.where(is_second, 2.5, 1.0)
+    noise = sigma[:, None, None] * rng.normal(size=corners.shape)
+    common = config.common_noise_px * rng.normal(size=(len(frame), 1, 2))
+    corners = corners + noise + common
+    is_wrong = rng.random(len(frame)) < config.wrong_shape
+    shape, corners = with_wrong_shapes(shape, corners, is_wrong, rng)
+    is_far_off = rng.random(len(frame)) < config.outliers
+    corners = with_outliers(corners, shape, is_far_off, config, rng)
+    score = rng.normal(0.92 - 1.5 / box.max(-1), 0.05)
+
+    true_rows = SignRows(
+        frame=frame,
+        shape=shape,
+        corners_px=corners,
+        code=_codes(signs, sign, config, rng),
+        score=np.clip(score, 0.05, 1.0),
+        track=track,
+        sign=sign,
+        is_outlier=is_wrong | is_far_off,
+    )
+    rows = concatenate(
+        (true_rows, ghosts(len(drive), camera, config, rng, int(track.max(initial=0))))
+    )
+    rows = rows[_inside(rows, camera)]
+    rows = rows[np.lexsort((rng.random(len(rows)), rows.frame))]
+    return _with_random_start(rows, rng)
+
+
+def _visible(
+    signs: WorldSigns, drive: Drive, camera: Camera, config: SignDetectionConfig
+) -> tuple[Int[np.ndarray, " d"], Int[np.ndarray, " d"], Float[np.ndarray, "d 8 2"]]:
+    """Frame, sign and exact corners [px] of all that a perfect detector would see."""
+    corners_world = signs.corners()
+    found = []
+    for first in range(0, len(drive), _CHUNK_FRAMES):
+        rows = slice(first, first + _CHUNK_FRAMES)
+        p, R = drive.p_world_camera[rows], drive.R_world_camera[rows]
+        ray = signs.center[None] - p[:, None]
+        distance = np.linalg.norm(ray, axis=-1)
+        depth = np.einsum("fsk,fk->fs", ray, R[:, :, 2])
+        facing = -np.einsum("fsk,sk->fs", ray, signs.normal) / np.maximum(distance, 1e-9)
+        seen = (depth > config.range_m[0]) & (depth < config.range_m[1])
+        frame, sign = np.nonzero(seen & (facing > np.cos(np.radians(config.view_angle_deg))))
+        p_camera = (corners_world[sign] - p[frame, None]) @ R[frame]
+        px, visible = project(camera, torch.from_numpy(p_camera))
+        whole = visible.all(-1).numpy() & (_boxes(px.numpy()).max(-1) >= config.min_box_px)
+        found.append((frame[whole] + first, sign[whole], px.numpy()[whole]))
+    frame, sign, corners = (np.concatenate(column) for column in zip(*found, strict=True))
+    return frame, sign, corners
+
+
+def _is_hidden(
+    frame: Int[np.ndarray, " d"],
+    sign: Int[np.ndarray, " d"],
+    count: int,
+    config: SignDetectionConfig,
+    rng: np.random.Generator,
+    frame_rate_hz: float,
+) -> Bool[np.ndarray, " d"]:
+    """True while something stands before the sign: one burst for some of the signs."""
+    first = np.full(count, np.iinfo(np.int64).max)
+    last = np.zeros(count, dtype=np.int64)
+    np.minimum.at(first, sign, frame)
+    np.maximum.at(last, sign, frame)
+    begins = first + rng.random(count) * np.maximum(last - first, 0)
+    lasts = rng.uniform(*config.occlusion_s, count) * frame_rate_hz
+    lasts = np.where(rng.random(count) < config.occlusions, lasts, 0.0)
+    return (frame >= begins[sign]) & (frame < begins[sign] + lasts[sign])
+
+
+def _tracks(
+    frame: Int[np.ndarray, " d"],
+    sign: Int[np.ndarray, " d"],
+    config: SignDetectionConfig,
+    rng: np.random.Generator,
+) -> Int[np.ndarray, " d"]:
+    """Track numbers: one for each sign until it is out of sight; some are wrong or missing."""
+    order = np.lexsort((frame, sign))
+    f, s = frame[order], sign[order]
+    begins = np.ones(len(f), dtype=bool)
+    begins[1:] = (s[1:] != s[:-1]) | (f[1:] - f[:-1] > 5)
+    begins |= rng.random(len(f)) < config.track_switches
+    number = np.cumsum(begins) - 1
+    # Numbers are given in the order of appearance.
+    rank = np.argsort(np.argsort(f[begins], kind="stable"), kind="stable")
+    track = np.empty(len(f), dtype=np.int64)
+    track[order] = rank[number]
+    by_frame = np.argsort(frame, kind="stable")
+    wrong = by_frame[1:][rng.random(max(len(f) - 1, 0)) < config.track_errors]
+    previous = np.empty(len(f), dtype=np.int64)
+    previous[by_frame[1:]] = track[by_frame[:-1]]
+    track[wrong] = previous[wrong]
+    return np.where(rng.random(len(f)) < config.null_track, -1, track)
+
+
+def _codes(
+    signs: WorldSigns,
+    sign: Int[np.ndarray, " d"],
+    config: SignDetectionConfig,
+    rng: np.random.Generator,
+) -> Int[np.ndarray, " d"]:
+    known = all_codes()
+    index = {code: k for k, code in enumerate(known)}
+    true_code = np.array([-1 if c is None else index[c] for c in signs.code], dtype=np.int64)
+    code = true_code[sign]
+    wrong = (code >= 0) & (rng.random(len(sign)) < config.wrong_code)
+    code = np.where(wrong, rng.integers(0, len(known), len(sign)), code)
+    return np.where(rng.random(len(sign)) < config.null_code, -1, code)
+
+
+def _boxes(corners: Float[np.ndarray, "d 8 2"]) -> Float[np.ndarray, "d 2"]:
+    return corners.max(1) - corners.min(1) if len(corners) else np.zeros((0, 2))
+
+
+def _inside(rows: SignRows, camera: Camera) -> Bool[np.ndarray, " d"]:
+    """True where all corners lie in the image: a detector reports nothing beyond it."""
+    low, high = -0.5, np.array([camera.width, camera.height]) - 0.5
+    is_inside = ((rows.corners_px > low) & (rows.corners_px < high)).all(-1)
+    padding = np.arange(8)[None] >= _CORNERS[rows.shape][:, None]
+    return np.all(is_inside | padding, axis=-1)
+
+
+def _with_random_start(rows: SignRows, rng: np.random.Generator) -> SignRows:
+    """The same outlines, each beginning at any of its corners."""
+    count = _CORNERS[rows.shape][:, None]
+    shift = (rng.random((len(rows), 1)) * count).astype(np.int64)
+    slot = (np.minimum(np.arange(8)[None], count - 1) + shift) % count
+    corners = np.take_along_axis(rows.corners_px, slot[:, :, None], axis=1)
+    return replace(rows, corners_px=corners)

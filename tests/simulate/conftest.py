@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from crowdmap_torch.simulate import WORLD_PRESETS, SimulationConfig, World, make_fleet, make_world
+from crowdmap_torch.simulate.rigs import SimulatedRig
+
+
+@pytest.fixture(scope="session")
+def suburb_config() -> SimulationConfig:
+    return SimulationConfig(world=replace(WORLD_PRESETS["suburb"], length_m=500.0), journeys=2)
+
+
+@pytest.fixture(scope="session")
+def suburb(suburb_config: SimulationConfig) -> World:
+    return make_world(suburb_config)
+
+
+@pytest.fixture(scope="session")
+def fleet(suburb_config: SimulationConfig) -> tuple[SimulatedRig, ...]:
+    return make_fleet(suburb_config)

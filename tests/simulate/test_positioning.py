@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crowdmap_torch.simulate.positioning import (
+    PRESETS,
+    PositioningConfig,
+    measured_poses,
+    pose_errors,
+    reported_sigmas,
+)
+
+PAPER = PRESETS["paper"]
+
+
+def _errors(config: PositioningConfig, draws: int, distance: np.ndarray):
+    return [pose_errors(distance, config, np.random.default_rng(k)) for k in range(draws)]
+
+
+def test_paper_and_consumer_presets_have_the_numbers_of_the_specification():
+    assert (PAPER.bias_e_m, PAPER.bias_n_m, PAPER.bias_u_m) == (0.30, 0.30, 0.42)
+    assert (PAPER.drift_m, PAPER.drift_length_m) == (0.25, 150.0)
+    assert (PAPER.drift_rot_deg, PAPER.drift_rot_length_m) == (0.15, 100.0)
+    assert 0.01 <= PAPER.white_e_m <= 0.02 and 0.01 <= PAPER.white_u_m <= 0.02
+    assert PAPER.white_rot_deg == 0.02
+    assert PRESETS["consumer"] == replace(PAPER, bias_e_m=0.85, bias_n_m=0.85, bias_u_m=1.2)
+
+
+def test_errors_have_the_stated_sigmas_wherever_one_looks():
+    """With 1500 draws a standard deviation is known to 2 %; 4 sigma of that is 8 %."""
+    errors = _errors(PAPER, 1500, np.array([0.0, 40.0, 300.0]))
+    translation = np.array([e.translation for e in errors])
+    rotation = np.array([e.rotation for e in errors])
+    position, turn = reported_sigmas(PAPER)  # type: ignore[misc]
+    for frame in range(3):  # stationary: the same at the start as later
+        np.testing.assert_allclose(translation[:, frame].std(0), position, rtol=0.08)
+        np.testing.assert_allclose(rotation[:, frame].std(0), turn, rtol=0.08)
+
+
+def test_drift_forgets_over_its_length():
+    only_drift = replace(PAPER, bias_e_m=0, bias_n_m=0, bias_u_m=0)
+    only_drift = replace(only_drift, white_e_m=0, white_n_m=0, white_u_m=0)
+    errors = _errors(only_drift, 1500, np.array([0.0, 75.0, 150.0]))
+    drift = np.array([e.translation for e in errors]).transpose(1, 0, 2).reshape(3, -1)
+    correlation = np.corrcoef(drift)
+    # 4500 pairs: a correlation is known to 0.015.
+    assert correlation[0, 1] == pytest.approx(np.exp(-0.5), abs=0.05)
+    assert correlation[0, 2] == pytest.approx(np.exp(-1.0), abs=0.06)
+
+
+def test_drift_stands_still_with_the_car_while_white_noise_goes_on():
+    distance = np.concatenate((np.linspace(0, 30, 40), np.full(400, 30.0)))
+    error = pose_errors(distance, PAPER, np.random.default_rng(0))
+    standing = error.translation[40:]
+    np.testing.assert_allclose(
+        standing.std(0), [PAPER.white_e_m, PAPER.white_n_m, PAPER.white_u_m], rtol=0.15
+    )
+    quiet = replace(PAPER, white_e_m=0, white_n_m=0, white_u_m=0, white_rot_deg=0)
+    error = pose_errors(distance, quiet, np.random.default_rng(0))
+    assert np.ptp(error.translation[40:], axis=0).max() == 0
+    assert np.ptp(error.rotation[40:], axis=0).max() == 0
+
+
+def test_shared_bias_is_the_same_in_all_journeys():
+    shared = replace(PAPER, shared_bias_e_m=2.0, shared_bias_u_m=-1.0)
+    distance = np.arange(10.0)
+    for seed in range(3):
+        own = pose_errors(distance, PAPER, np.random.default_rng(seed))
+        with_shared = pose_errors(distance, shared, np.random.default_rng(seed))
+        np.testing.assert_allclose(
+            with_shared.translation - own.translation, np.tile([2.0, 0, -1.0], (10, 1)), atol=1e-12
+        )
+
+
+def test_sigmas_can_be_wrong_or_missing():
+    position, turn = reported_sigmas(PAPER)  # type: ignore[misc]
+    wrong, wrong_turn = reported_sigmas(replace(PAPER, sigma_scale=3.0))  # type: ignore[misc]
+    np.testing.assert_allclose(wrong, 3 * position)
+    assert wrong_turn == pytest.approx(3 * turn)
+    assert reported_sigmas(replace(PAPER, sigmas=False)) is None
+
+
+def test_measured_pose_is_the_true_one_moved_along_world_axes_and_turned_about_its_own():
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[:, :3, :3] = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    error = pose_errors(np.array([0.0, 5.0]), PAPER, np.random.default_rng(3))
+    measured = measured_poses(T, error)
+    np.testing.assert_allclose(measured[:, :3, 3] - T[:, :3, 3], error.translation)
+    turn = T[:, :3, :3].transpose(0, 2, 1) @ measured[:, :3, :3]
+    # Errors of a few milliradians: the rotation matrix is I + skew(w) up to w^2 / 2, 1e-5.
+    np.testing.assert_allclose(turn[:, 2, 1], error.rotation[:, 0], atol=1e-4)
+    np.testing.assert_allclose(turn[:, 1, 0], error.rotation[:, 2], atol=1e-4)
