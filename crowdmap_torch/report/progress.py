@@ -6,6 +6,9 @@ import sys
 import time
 from typing import TextIO
 
+_PLAIN_EVERY_S = 10.0
+"""Without a terminal a stage says no more often how far it is."""
+
 
 class Progress:
     """Says which stage runs, how far it is, and when it will be done; keeps each stage's seconds."""
@@ -16,6 +19,7 @@ class Progress:
         self._rewrites = self._stream.isatty()
         self._stage = ""
         self._started = time.monotonic()
+        self._said = self._started
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
         """Tell that `done` of `total` steps of a stage are finished; a new name starts a new stage."""
@@ -32,8 +36,9 @@ class Progress:
             text += f", {note}"
         if self._rewrites:
             self._stream.write(f"\r\x1b[K{text}")
-        elif not total or done == total or note:
+        elif not total or done == total or now - self._said > _PLAIN_EVERY_S:
             self._stream.write(f"{text}\n")
+            self._said = now
         self._stream.flush()
 
     def finish(self) -> None:

@@ -1,0 +1,241 @@
+"""The unknowns of bundle adjustment, the observations of them, and the least-squares problem that they make (V-B, eq:ba)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from crowdmap_torch import residuals
+from crowdmap_torch.geometry import spline_basis
+from crowdmap_torch.lane_matching import LaneMatches, follow
+from crowdmap_torch.observations import CornerObservations, LanePointObservations
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.chain import ChainBackend
+from crowdmap_torch.optim.linearize import residuals as whitened_residuals
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable
+from crowdmap_torch.optim.robust import Tukey, median_scale
+
+
+@dataclass(frozen=True)
+class PosePriorConfig:
+    """What the positioning module gets wrong, where poses.parquet does not say; all sigmas per axis."""
+
+    bias_sigma_m: tuple[float, float, float] = (0.6, 0.6, 0.9)
+    """Constant error of a journey: east, north, up."""
+    drift_sigma_m: float = 0.25
+    """Slow error of the position, a Gauss-Markov chain along the way."""
+    drift_length_m: float = 150.0
+    """Way over which the drift's correlation falls to 1/e."""
+    rotation_sigma_deg: float = 0.2
+    """Slow error of the rotation about each axis."""
+    rotation_length_m: float = 100.0
+    """Way over which the rotation's correlation falls to 1/e."""
+    white_sigma_m: float = 0.02
+    """Noise of the position from frame to frame."""
+    white_sigma_deg: float = 0.03
+    """Noise of the rotation from frame to frame."""
+
+
+@dataclass(frozen=True)
+class AdjustConfig:
+    """Bundle adjustment (V-B)."""
+
+    lm: lm.LmConfig = field(
+        default_factory=lambda: lm.LmConfig(max_iterations=30, cost_tolerance=1e-4)
+    )
+    """The solver; its tolerance counts once the scales stand still."""
+    prior: PosePriorConfig = field(default_factory=PosePriorConfig)
+    """What the poses may be wrong by."""
+    tukey_c: float = 4.685
+    """Residuals beyond this many standard deviations have no weight."""
+    sign_sigma_px: float = 0.5
+    """Least standard deviation of a sign corner; more where the residuals say so."""
+    lane_sigma_px: float = 0.8
+    """Least standard deviation of a lane point across the marker."""
+    lane_correlation: float = 2.0
+    """Factor on the lane points' sigma: the points of one detection err together."""
+    lane_height_sigma_m: float = 0.05
+    """How well the road under the car tells a marker's height."""
+    lane_gate_m: float = 0.9
+    """Lane points further from every lane than this, before adjustment, are left out."""
+    lane_slide_sigma_m: float = 0.5
+    """Prior of control points along the marker."""
+    lane_shift_sigma_m: float = 1.5
+    """Prior of control points across the marker and upwards: weak, for stretches hardly seen."""
+    drift_spacing_m: float = 2.0
+    """Stretch over which the drift of the poses is taken to stand still."""
+    keyframe_spacing_m: float = 2.0
+    """Lane points are taken from frames this far apart."""
+    points_per_detection: int = 6
+    """Most points of a lane detection that are used."""
+    max_ground_distance_m: float = 25.0
+    """Lane points that meet the road further ahead are left out."""
+    frame_spacing_m: float = 0.25
+    """Frames closer together than this (a car at a light) are thinned."""
+
+
+@dataclass(frozen=True)
+class DriftNodes:
+    """Stretches of road with one drift each: the blocks that form a journey's chain."""
+
+    of_frame: Int[Tensor, " p"]
+    """Node of each pose of the bundle."""
+    first: Int[Tensor, " n"]
+    """First pose of each node."""
+    journey: Int[Tensor, " n"]
+    way: Float[Tensor, " n"]
+    """Distance travelled at the node [m]."""
+
+
+class Bundle(nn.Module):
+    """The unknowns of bundle adjustment and all observations of them.
+
+    Every unknown is a base value on its manifold (a buffer) and a tangent increment (an `nn.Parameter`) that is zero at
+    rest: `state_dict()` is the checkpoint, `.to(device)` moves everything, and an optimiser that steps the increments stays on
+    the manifold.
+    """
+
+    def __init__(
+        self,
+        values: dict[str, Tensor],
+        variables: dict[str, Variable],
+        fixed: dict[str, CostTerm],
+        corners: CornerObservations,
+        lane_points: LanePointObservations,
+        matches: LaneMatches,
+        lane_count: Int[Tensor, " n"],
+        frame: Int[Tensor, " p"],
+        nodes: DriftNodes,
+        config: AdjustConfig,
+    ) -> None:
+        super().__init__()
+        self.variables = variables
+        self.names = tuple(values)
+        for name, value in values.items():
+            self.register_buffer(f"base_{name}", value.clone())
+            increment = value.new_zeros(len(value), variables[name].tangent_dim)
+            self.register_parameter(f"delta_{name}", nn.Parameter(increment))
+        self.register_buffer("scale", torch.full((2,), torch.inf, dtype=values["pose"].dtype))
+        self.fixed = fixed
+        self.corners = corners
+        self.lane_points = lane_points
+        self.matches = matches
+        self.lane_count = lane_count
+        self.config = config
+        self.frame = frame
+        """Frame of each pose, counted over all journeys."""
+        self.nodes = nodes
+        self.lane_rows: Tensor | None = None
+
+    def values(self) -> dict[str, Tensor]:
+        """Base values moved by the increments."""
+        return {
+            name: self.variables[name].retract(
+                getattr(self, f"base_{name}"), getattr(self, f"delta_{name}")
+            )
+            for name in self.names
+        }
+
+    @torch.no_grad()
+    def fold(self, values: dict[str, Tensor]) -> None:
+        """Makes `values` the base and sets the increments to zero."""
+        for name in self.names:
+            getattr(self, f"base_{name}").copy_(values[name])
+            getattr(self, f"delta_{name}").zero_()
+
+    def backend(self) -> ChainBackend:
+        """The solver's back end: frames hang on the drift's chains, and both are eliminated."""
+        return ChainBackend(
+            "drift", self.nodes.journey, leaves="pose", carrier=self.nodes.of_frame
+        )
+
+    @torch.no_grad()
+    def refresh(self) -> bool:
+        """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
+
+        The scales start at what the residuals show, so that a wrong start does not make outliers of everything, and fall
+        as the fit improves; they never grow again.
+        """
+        values = self.values()
+        if len(self.lane_points):
+            pose = values["pose"][self.lane_points.frame]
+            self.matches = follow(
+                self.matches, self.lane_points, pose, values["lane"], self.lane_count
+            )
+            rows, weight, _ = spline_basis.window_flat(
+                self.matches.t.clamp_min(0),
+                spline_basis.starts(self.lane_count)[self.matches.lane],
+                self.lane_count[self.matches.lane],
+            )
+            # The same index tensors mean the same structure to the back end: keep them while they hold.
+            if self.lane_rows is None or not torch.equal(rows, self.lane_rows):
+                self.lane_rows = rows
+                self.lane_slots = tuple(("lane", column.contiguous()) for column in rows.unbind(1))
+            self.lane_weight = weight
+        seen = self._residual_scales(values)
+        narrowed = torch.minimum(self.scale, seen)
+        at_rest = bool((narrowed > 0.97 * self.scale).all())
+        self.scale.copy_(narrowed)
+        return at_rest
+
+    def problem(self) -> Problem:
+        """The least-squares problem with the matches and scales of the moment."""
+        terms = dict(self.fixed)
+        terms.update(self._corner_term(float(self.scale[0])))
+        terms.update(self._lane_terms(float(self.scale[1]) * self.config.lane_correlation))
+        return Problem(self.variables, terms)
+
+    def _corner_term(self, sigma: float) -> dict[str, CostTerm]:
+        rows = self.corners
+        if not len(rows):
+            return {}
+        term = CostTerm(
+            residuals.sign_reprojection,
+            (("pose", rows.frame), ("sign", rows.sign), ("size", rows.sign)),
+            (rows.template, rows.matrix),
+            rows.template.new_full((len(rows),), 1 / sigma),
+            Tukey(self.config.tukey_c),
+            residuals.sign_reprojection_jacobian,
+        )
+        return {"sign_reprojection": term}
+
+    def _lane_terms(self, sigma: float) -> dict[str, CostTerm]:
+        rows = self.lane_points
+        if not len(rows):
+            return {}
+        valid = self.matches.valid.to(self.lane_weight)
+        slots = (("pose", rows.frame), *self.lane_slots)
+        image = CostTerm(
+            residuals.lane_reprojection,
+            slots,
+            (self.lane_weight, self.matches.normal_px, rows.matrix),
+            valid / sigma,
+            Tukey(self.config.tukey_c),
+            residuals.lane_reprojection_jacobian,
+        )
+        height = CostTerm(
+            residuals.lane_height,
+            slots,
+            (self.lane_weight, rows.normal_camera, rows.camera_height),
+            valid / rows.height_sigma,
+            Tukey(self.config.tukey_c),
+            residuals.lane_height_jacobian,
+        )
+        return {"lane_reprojection": image, "lane_height": height}
+
+    def _residual_scales(self, values: dict[str, Tensor]) -> Float[Tensor, " 2"]:
+        """Robust standard deviation of corner and lane residuals [px], at least the configured ones."""
+        config = self.config
+        scale = self.scale.new_tensor([config.sign_sigma_px, config.lane_sigma_px])
+        for term in self._corner_term(1.0).values():
+            # Of a two-dimensional normal residual the median length is 1.1774 sigma.
+            length = whitened_residuals(term, values).norm(dim=-1)
+            scale[0] = (length.median() / 1.1774).clamp_min(config.sign_sigma_px)
+        if len(self.lane_points):
+            term = self._lane_terms(1.0)["lane_reprojection"]
+            residual = whitened_residuals(term, values)[self.matches.valid, 0]
+            scale[1] = median_scale(residual, floor=config.lane_sigma_px)
+        return scale

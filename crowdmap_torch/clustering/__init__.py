@@ -1,0 +1,1 @@
+"""Clustering of observations and landmarks."""

@@ -1,0 +1,60 @@
+"""Gated one-to-one matching of many rows to many slots along sparse candidate pairs, optimal in total cost."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import sparse
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+
+def match_slots(
+    row: Int[Tensor, " p"],
+    slot: Int[Tensor, " p"],
+    cost: Float[Tensor, " p"],
+    *,
+    rows: int,
+    unmatched_cost: float,
+) -> Int[Tensor, " n"]:
+    """The slot of each of the `rows` rows, -1 for none, at the least total cost.
+
+    Each slot takes at most one row; a row left without a slot costs `unmatched_cost`, so dearer pairs are never used.
+    Rows whose cheapest slots differ from all others' take those at once; only where rows compete is an assignment
+    problem solved, one for each set of rows that are connected by their candidates.
+    """
+    device = row.device
+    keep = (cost < unmatched_cost).cpu().numpy()
+    i, raw, c = (t.detach().cpu().numpy()[keep] for t in (row, slot, cost))
+    result = np.full(rows, -1, dtype=np.int64)
+    if not len(i):
+        return torch.from_numpy(result).to(device)
+    slots, s = np.unique(raw, return_inverse=True)
+    order = np.lexsort((s, c, i))
+    first = np.concatenate(([True], i[order][1:] != i[order][:-1]))
+    best = order[first]  # the cheapest pair of every row that has one
+    taken = np.bincount(s[best], minlength=len(slots))
+    graph = sparse.coo_matrix((np.ones(len(i)), (i, rows + s)), shape=(rows + len(slots),) * 2)
+    _, part = connected_components(graph, directed=False)
+    contended = np.zeros(int(part.max()) + 1, dtype=bool)
+    contended[part[rows:][taken > 1]] = True
+    free = best[~contended[part[i[best]]]]
+    result[i[free]] = slots[s[free]]
+
+    pairs = np.nonzero(contended[part[i]])[0]
+    pairs = pairs[np.argsort(part[i[pairs]], kind="stable")]
+    if len(pairs):
+        cuts = np.nonzero(np.diff(part[i[pairs]]))[0] + 1
+        for block in np.split(pairs, cuts):
+            block_rows, r = np.unique(i[block], return_inverse=True)
+            block_slots, k = np.unique(s[block], return_inverse=True)
+            matrix = np.full((len(block_rows), len(block_slots) + len(block_rows)), 1e12)
+            matrix[r, k] = c[block]
+            own = np.arange(len(block_rows))
+            matrix[own, len(block_slots) + own] = unmatched_cost
+            chosen_rows, chosen = linear_sum_assignment(matrix)
+            real = chosen < len(block_slots)
+            result[block_rows[chosen_rows[real]]] = slots[block_slots[chosen[real]]]
+    return torch.from_numpy(result).to(device)

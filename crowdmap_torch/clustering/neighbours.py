@@ -1,0 +1,44 @@
+"""Pairs of points that are near each other, by a k-d tree: memory grows with the number of points, not of pairs."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+
+def near_pairs(point: Float[Tensor, "n d"], *, radius: float, count: int) -> Int[Tensor, "m 2"]:
+    """Unordered pairs of points within `radius`, where one is among the `count` nearest of the other.
+
+    The first index of a pair is the smaller one; pairs are sorted.
+    """
+    n = len(point)
+    if n < 2:
+        return torch.zeros(0, 2, dtype=torch.int64, device=point.device)
+    tree_points = point.detach().cpu().numpy()
+    k = min(count + 1, n)  # every point finds itself
+    _, found = KDTree(tree_points).query(tree_points, k=k, distance_upper_bound=radius)
+    found = found.reshape(n, k)
+    i, place = np.nonzero(found < n)  # a miss is reported as n
+    j = found[i, place]
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    key = np.unique((low * n + high)[low != high])
+    return torch.from_numpy(np.stack((key // n, key % n), axis=1)).to(point.device)
+
+
+def cross_pairs(
+    query: Float[Tensor, "n d"], point: Float[Tensor, "m d"], *, radius: float, count: int
+) -> Int[Tensor, "p 2"]:
+    """Rows of `query` with each of the up to `count` nearest rows of `point` within `radius`, sorted."""
+    if not len(query) or not len(point):
+        return torch.zeros(0, 2, dtype=torch.int64, device=query.device)
+    k = min(count, len(point))
+    tree = KDTree(point.detach().cpu().numpy())
+    _, found = tree.query(query.detach().cpu().numpy(), k=k, distance_upper_bound=radius)
+    found = found.reshape(len(query), k)
+    i, place = np.nonzero(found < len(point))
+    pairs = np.stack((i, found[i, place]), axis=1)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    return torch.from_numpy(pairs[order]).to(query.device)

@@ -1,0 +1,135 @@
+"""The whole configuration: the stages' configs composed, read from strict YAML."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from crowdmap_torch.bundle import AdjustConfig
+from crowdmap_torch.crowd import CrowdConfig
+from crowdmap_torch.stages.associate import SignAssociationConfig
+from crowdmap_torch.stages.associate_lanes import LaneAssociationConfig
+from crowdmap_torch.stages.cluster_lanes import LaneClusterConfig
+from crowdmap_torch.stages.join_lanes import LaneJoinConfig
+from crowdmap_torch.stages.lanes import LaneConfig
+from crowdmap_torch.stages.road import RoadConfig
+from crowdmap_torch.stages.signs import SignTriangulationConfig
+
+Config = TypeVar("Config")
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """Everything that can be set; a YAML file names only what differs from the defaults."""
+
+    sign_association: SignAssociationConfig = field(default_factory=SignAssociationConfig)
+    """IV-A, signs."""
+    lane_association: LaneAssociationConfig = field(default_factory=LaneAssociationConfig)
+    """IV-A, lanes."""
+    sign_triangulation: SignTriangulationConfig = field(default_factory=SignTriangulationConfig)
+    """IV-B."""
+    road: RoadConfig = field(default_factory=RoadConfig)
+    """IV-C."""
+    lane: LaneConfig = field(default_factory=LaneConfig)
+    """IV-D."""
+    crowd: CrowdConfig = field(default_factory=CrowdConfig)
+    """V-A and V-B: clustering and alignment of signs, repeated."""
+    lane_join: LaneJoinConfig = field(default_factory=LaneJoinConfig)
+    """V-A: lanes of many journeys."""
+    lane_cluster: LaneClusterConfig = field(default_factory=LaneClusterConfig)
+    """V-A.2, with `method: paper2017`."""
+    adjust: AdjustConfig = field(default_factory=AdjustConfig)
+    """V-B: bundle adjustment."""
+    seed: int = 0
+    """Of k-means; the same seed and data give the same map."""
+    min_confidence: float = 0.5
+    """Signs below this go to tentative_signs.parquet."""
+
+
+def load_config(path: Path | str | None) -> MapperConfig:
+    """The configuration of a YAML file, or the defaults; ValueError names the file, the key and what was expected."""
+    if path is None:
+        return MapperConfig()
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror}); name a YAML file") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
+    return parse(MapperConfig, {} if content is None else content, where=str(path))
+
+
+def parse(kind: type[Config], content: Any, *, where: str) -> Config:
+    """A config dataclass from nested mappings; an unknown key or a value of the wrong type is a ValueError."""
+    if not isinstance(content, Mapping):
+        raise ValueError(f"{where}: expected keys and values, found {content!r}")
+    known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
+    hints = typing.get_type_hints(kind)
+    given = {}
+    for key, value in content.items():
+        if key not in known:
+            raise ValueError(
+                f"{where}: unknown key {key!r}; expected one of {', '.join(sorted(known))}"
+            )
+        given[key] = _value(hints[key], value, where=f"{where}: {key}")
+    try:
+        return kind(**given)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def as_dict(config: MapperConfig) -> dict[str, Any]:
+    """The configuration as nested plain values, defaults filled in."""
+    return json.loads(json.dumps(asdict(config)))
+
+
+def dump(config: MapperConfig) -> str:
+    """The configuration as YAML, defaults filled in."""
+    return yaml.safe_dump(as_dict(config), sort_keys=False)
+
+
+def config_hash(config: MapperConfig) -> str:
+    """Twelve hex digits that differ where configurations differ."""
+    text = json.dumps(as_dict(config), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _value(hint: Any, value: Any, *, where: str) -> Any:
+    if is_dataclass(hint):
+        return parse(typing.cast(type, hint), value, where=where)
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _value(next(a for a in arguments if a is not type(None)), value, where=where)
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise ValueError(f"{where}: expected a list, found {value!r}")
+        endless = len(arguments) == 2 and arguments[1] is Ellipsis
+        kinds = [arguments[0]] * len(value) if endless else list(arguments)
+        if len(kinds) != len(value):
+            raise ValueError(f"{where}: expected {len(kinds)} values, found {len(value)}")
+        return tuple(
+            _value(kind, item, where=f"{where}[{i}]")
+            for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
+        )
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    # YAML reads 1e-6 (without a dot) as text.
+    if hint is float and isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
+        raise ValueError(f"{where}: expected {hint.__name__}, found {value!r}")
+    return value

@@ -1,0 +1,59 @@
+"""Curves drawn out at their ends as far as the samples go: ridges end early, and where a branch leaves its trunk."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.lines import LineSamples
+from crowdmap_torch.courses.curves import Curves, Match
+
+_BIN = 2.0
+"""Support is counted over stretches of this length [m]."""
+
+
+def drawn_out(curves: Curves, by: float) -> tuple[Float[Tensor, "m 3"], Int[Tensor, " m"]]:
+    """The points of curves with straight ends of `by` [m] put on, a metre between points, and the curve of each.
+
+    Rings, whose ends meet already, stay as they are.
+    """
+    n = len(curves)
+    size = torch.bincount(curves.curve, minlength=n)
+    first = size.cumsum(0) - size
+    last = first + size - 1
+    steps = torch.arange(1, int(by) + 1, device=size.device).to(curves.point)
+    pieces = []
+    for end, way in ((first, -steps.flip(0)), (last, steps)):
+        along = torch.cat((curves.direction[end], curves.slope[end, None]), dim=1)
+        pieces.append(curves.point[end][:, None] + way[:, None] * along[:, None])
+    point = torch.cat((pieces[0].flatten(0, 1), curves.point, pieces[1].flatten(0, 1)))
+    own = torch.arange(n, device=size.device).repeat_interleave(len(steps))
+    curve = torch.cat((own, curves.curve, own))
+    gap = (curves.point[first] - curves.point[last]).norm(dim=1)
+    is_ring = (gap < 1.0) & (curves.length > 4 * by)
+    is_new = torch.ones_like(curve, dtype=torch.bool)
+    is_new[len(own) : len(own) + len(curves.curve)] = False
+    rows = (~(is_new & is_ring[curve])).nonzero()[:, 0]
+    rows = rows[curve[rows].argsort(stable=True)]
+    return point[rows], curve[rows]
+
+
+def supported_rows(
+    curves: Curves, samples: LineSamples, matched: Match, min_owners: int
+) -> Bool[Tensor, " k"]:
+    """Points of curves from the first to the last place that at least `min_owners` owners saw."""
+    used = matched.curve >= 0
+    bins = int((curves.station / _BIN).max()) + 2 if len(curves.station) else 1
+    place = matched.curve[used] * bins + (matched.station[used] / _BIN).long().clamp(0, bins - 1)
+    owners = int(samples.owner.max()) + 1 if len(samples) else 1
+    seen = torch.unique(place * owners + samples.owner[used]) // owners
+    enough = torch.bincount(seen, minlength=len(curves) * bins) >= min_owners
+    own = (curves.station / _BIN).long().clamp(0, bins - 1)
+    is_seen = enough[curves.curve * bins + own]
+    row = torch.arange(len(own), device=own.device)
+    low = torch.full((len(curves),), len(row), device=row.device)
+    low = low.scatter_reduce(0, curves.curve[is_seen], row[is_seen], "amin")
+    high = torch.full((len(curves),), -1, device=row.device)
+    high = high.scatter_reduce(0, curves.curve[is_seen], row[is_seen], "amax")
+    return (row >= low[curves.curve]) & (row <= high[curves.curve])

@@ -1,0 +1,204 @@
+"""Lane pieces of many journeys as samples with a direction, in the order that neighbour searches want."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import group_sum
+from crowdmap_torch.clustering.lines import LineSamples
+from crowdmap_torch.clustering.lines import merged as merged_lines
+from crowdmap_torch.geometry import spline
+from crowdmap_torch.tables import Lanes
+
+_DRIFT_SIGMA = 0.2
+"""What a sample's own sigma is compared with to give its weight [m]: beyond, better samples hardly help."""
+
+
+@dataclass(frozen=True)
+class LaneSamples:
+    """Samples of lane pieces, those of one (journey, tracklet) adjacent."""
+
+    line: LineSamples
+    """Tracks are (journey, tracklet) pairs, owners journeys; directions are those in which the pieces' points run."""
+    piece: Int[Tensor, " s"]
+    """Row of the piece; one of several where samples were merged."""
+    station: Float[Tensor, " s"]
+    """How far along its journey the sample lies [m], up to a constant of the journey."""
+    frame: Int[Tensor, " s"]
+    """Frame index of the piece."""
+    track_of_piece: Int[Tensor, " n"]
+
+    def __len__(self) -> int:
+        return len(self.piece)
+
+    def __getitem__(self, index: Tensor) -> LaneSamples:
+        """The samples at `index`."""
+        return replace(
+            self,
+            line=self.line[index],
+            piece=self.piece[index],
+            station=self.station[index],
+            frame=self.frame[index],
+        )
+
+    def moved(self, offset: Float[Tensor, "s 3"]) -> LaneSamples:
+        """The samples, each moved by its row of `offset`."""
+        return replace(self, line=replace(self.line, point=self.line.point + offset))
+
+
+def sample_lanes(lanes: Lanes, spacing: float) -> LaneSamples:
+    """Samples of all pieces at most `spacing` [m] apart."""
+    packed = lanes.select(torch.arange(len(lanes), device=lanes.journey.device))
+    control, count = packed.control.point_world, packed.control_count
+    piece, t = even_parameters(control, count, spacing)
+    point, direction, slope = places(control, count, t, piece)
+    first = spline.starts(count)[piece]
+    below = torch.minimum(t.floor().long(), count[piece] - 2)
+    share = t - below
+    sigma = packed.control.sigma
+    sigma = (1 - share) * sigma[first + below] + share * sigma[first + below + 1]
+    track = _tracks(lanes)
+    station = _stations(lanes, point, direction, piece)
+    line = LineSamples(
+        point=point,
+        direction=direction,
+        slope=slope,
+        kind=lanes.type[piece],
+        track=track[piece],
+        owner=lanes.journey[piece],
+        weight=_DRIFT_SIGMA**2 / (_DRIFT_SIGMA**2 + sigma.square()),
+    )
+    order = track[piece].argsort(stable=True)
+    return LaneSamples(
+        line=line[order],
+        piece=piece[order],
+        station=station[order],
+        frame=lanes.frame[piece][order],
+        track_of_piece=track,
+    )
+
+
+def merged(samples: LaneSamples, cell: float) -> tuple[LaneSamples, Int[Tensor, " s"]]:
+    """Samples of one track in the same cell of a grid made one, and where each went: overlapping pieces become one."""
+    line, cell_of = merged_lines(samples.line, cell)
+    last = torch.zeros(len(line), dtype=torch.int64, device=cell_of.device)
+    last[cell_of] = torch.arange(len(cell_of), device=cell_of.device)
+    number = torch.bincount(cell_of, minlength=len(line))
+    result = LaneSamples(
+        line=line,
+        piece=samples.piece[last],
+        station=group_sum(samples.station, cell_of, len(line)) / number,
+        frame=samples.frame[last],
+        track_of_piece=samples.track_of_piece,
+    )
+    return result, cell_of
+
+
+def stray_samples(samples: LaneSamples, *, beside: tuple[float, float]) -> Bool[Tensor, " s"]:
+    """Samples of pieces that stray: another piece of the same tracklet runs beside them.
+
+    A tracklet is one marker. Where two of its pieces lie `beside` (least and largest distance [m]) each other one of
+    them is wrong, and that is the one more of whose length is at odds with others; both, if they are alike.
+    """
+    line = samples.line
+    least, largest = beside
+    reach = (largest**2 + 1.5**2) ** 0.5
+    # Tracks lie in layers of their own, farther apart than the search reaches.
+    layered = torch.cat((line.point, 2 * reach * line.track[:, None].to(line.point)), dim=1)
+    pair = KDTree(layered.detach().cpu().numpy()).query_pairs(reach, output_type="ndarray")
+    i, j = torch.from_numpy(pair.astype(np.int64)).to(line.track.device).T
+    delta = line.point[j] - line.point[i]
+    axis = line.direction[i]
+    along = (delta[:, 0] * axis[:, 0] + delta[:, 1] * axis[:, 1]).abs()
+    across = (axis[:, 0] * delta[:, 1] - axis[:, 1] * delta[:, 0]).abs()
+    at_odds = (
+        (samples.piece[i] != samples.piece[j])
+        & (along < 1.5)
+        & (across > least)
+        & (across < largest)
+    )
+    i, j = i[at_odds], j[at_odds]
+    doubtful = torch.zeros(len(samples), dtype=torch.bool, device=i.device)
+    doubtful[i] = doubtful[j] = True
+    pieces = len(samples.track_of_piece)
+    number = torch.bincount(samples.piece, minlength=pieces).clamp_min(1)
+    share = torch.bincount(samples.piece[doubtful], minlength=pieces) / number
+    a, b = share[samples.piece[i]], share[samples.piece[j]]
+    stray = torch.zeros_like(doubtful)
+    stray[i[a >= b]] = True
+    stray[j[b >= a]] = True
+    # Where nothing runs beside a piece that strays elsewhere, it is no better.
+    share = torch.bincount(samples.piece[stray], minlength=pieces) / number
+    return (share > 0.3)[samples.piece] | stray
+
+
+def even_parameters(
+    control: Float[Tensor, "c 3"], count: Int[Tensor, " n"], spacing: float
+) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+    """Spline and parameter of points about `spacing` [m] apart, even in the parameter, both ends included."""
+    owner, rank = spline.rows(count)
+    chord = (control[1:, :2] - control[:-1, :2]).norm(dim=1)
+    length = group_sum(chord * (rank[1:] > 0), owner[1:], len(count))
+    number = (length / spacing).ceil().long().clamp_min(1) + 1
+    owner, rank = spline.rows(number)
+    return owner, rank.to(control) * (count[owner] - 1) / (number[owner] - 1)
+
+
+def places(
+    control: Float[Tensor, "c 3"],
+    count: Int[Tensor, " n"],
+    t: Float[Tensor, " m"],
+    owner: Int[Tensor, " m"],
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 2"], Float[Tensor, " m"]]:
+    """Points of splines, their horizontal directions, and the slopes along them."""
+    index, weight, d_weight = spline.window_flat(t, spline.starts(count)[owner], count[owner])
+    near = spline.to_coefficients_flat(control, count)[index]
+    point = (weight[:, None] @ near)[:, 0]
+    tangent = (d_weight[:, None] @ near)[:, 0]
+    run = tangent[:, :2].norm(dim=1).clamp_min(1e-9)
+    return point, tangent[:, :2] / run[:, None], tangent[:, 2] / run
+
+
+def _tracks(lanes: Lanes) -> Int[Tensor, " n"]:
+    """Number of each piece's (journey, tracklet), ascending with the journey."""
+    if not len(lanes):
+        return lanes.journey
+    tracklet = lanes.tracklet - lanes.tracklet.min()
+    key = lanes.journey * (tracklet.max() + 1) + tracklet
+    return torch.unique(key, return_inverse=True)[1]
+
+
+def _stations(
+    lanes: Lanes,
+    point: Float[Tensor, "s 3"],
+    direction: Float[Tensor, "s 2"],
+    piece: Int[Tensor, " s"],
+) -> Float[Tensor, " s"]:
+    """How far along its journey each sample lies: frames tell the order, the pieces the way.
+
+    Of the pieces of one frame, the mean place and direction are taken; steps between frames count along the direction
+    only, as a marker farther to the left is no way that was driven.
+    """
+    if not len(lanes):
+        return point.new_zeros(0)
+    frame = lanes.frame - lanes.frame.min()
+    key = lanes.journey * (frame.max() + 1) + frame
+    stops, stop = torch.unique(key, return_inverse=True)
+    journey = stops // (frame.max() + 1)
+    n = len(stops)
+    stop_of_sample = stop[piece]
+    number = torch.bincount(stop_of_sample, minlength=n).clamp_min(1).to(point)
+    middle = group_sum(point[:, :2], stop_of_sample, n) / number[:, None]
+    way = torch.nn.functional.normalize(group_sum(direction, stop_of_sample, n), dim=1)
+    mean_way = torch.nn.functional.normalize(way[1:] + way[:-1], dim=1)
+    step = ((middle[1:] - middle[:-1]) * mean_way).sum(1)
+    step = torch.where(journey[1:] == journey[:-1], step, torch.zeros_like(step))
+    station = torch.cat((step.new_zeros(1), step)).cumsum(0)
+    ahead = ((point[:, :2] - middle[stop_of_sample]) * way[stop_of_sample]).sum(1)
+    return station[stop_of_sample] + ahead

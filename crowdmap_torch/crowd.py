@@ -1,0 +1,374 @@
+"""V-A.1 and V-B as one problem: clusters give biases, biases sharpen clusters, coarse to fine, until nothing moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import distinct_pairs
+from crowdmap_torch.clustering.spectral import renumber, same_partition
+from crowdmap_torch.crowd_signs import CrowdSigns
+from crowdmap_torch.stages.align import (
+    AlignConfig,
+    JourneyBias,
+    align_journeys,
+    bias_at,
+    largest_drift,
+    no_bias,
+)
+from crowdmap_torch.stages.cluster import (
+    SignClusterConfig,
+    Spectrum,
+    cluster_signs,
+    moved,
+    rough_heads,
+    sign_heads,
+)
+from crowdmap_torch.stages.existence import (
+    ExistenceConfig,
+    existence,
+    has_company,
+    passing_journeys,
+)
+from crowdmap_torch.stages.match import (
+    SignMatchConfig,
+    harvest_signs,
+    match_signs,
+    merge_heads,
+    split_by_conflicts,
+    without_small,
+)
+from crowdmap_torch.stages.suspects import (
+    JourneyStatistics,
+    SuspectConfig,
+    SuspectJourney,
+    journey_statistics,
+    suspect_journeys,
+)
+from crowdmap_torch.stages.vote import VoteConfig, vote_biases
+from crowdmap_torch.tables import Signs
+
+METHODS = ("joint", "paper2017")
+
+
+@dataclass(frozen=True)
+class CrowdConfig:
+    """How the signs of many journeys are told apart and the journeys' biases found."""
+
+    method: str = "joint"
+    """`joint`, or `paper2017`: the paper's clusters and mean biases, repeated until the clusters stand still."""
+    shift_sigmas_m: tuple[float, ...] = (0.45, 0.3, 0.2, 0.15)
+    """`joint`: how uncertain the journeys' shifts are taken to be, coarse to fine, 1-sigma along each axis [m]."""
+    least_sigma_m: tuple[float, float, float] = (0.25, 0.12, 0.06)
+    """`joint`: least 1-sigma of a journey's sign along the line of sight, across it and upwards, shifts left out [m].
+
+    The covariance from triangulation knows pixels, not how poses wander while a sign is in view.
+    """
+    rounds: int = 4
+    """Most alternations of clustering and alignment for each of these (`paper2017`: in all)."""
+    stands_still: float = 0.001
+    """`joint`: clusters stand still when at most this share of the signs changes."""
+    min_journeys: int = 2
+    """Signs seen by fewer journeys are singles: kept apart as tentative (of one journey alone, its signs are the map)."""
+    cluster: SignClusterConfig = field(default_factory=SignClusterConfig)
+    """Grouping from places alone."""
+    match: SignMatchConfig = field(default_factory=SignMatchConfig)
+    """Each journey's signs against the clusters."""
+    vote: VoteConfig = field(default_factory=VoteConfig)
+    """First biases."""
+    align: AlignConfig = field(default_factory=AlignConfig)
+    """Biases from clusters."""
+    existence: ExistenceConfig = field(default_factory=ExistenceConfig)
+    """Confidence in signs."""
+    suspect: SuspectConfig = field(default_factory=SuspectConfig)
+    """Bad drives."""
+
+    def __post_init__(self) -> None:
+        """Refuses an unknown method."""
+        if self.method not in METHODS:
+            raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
+
+
+@dataclass(frozen=True)
+class CrowdRound:
+    """One alternation of clustering and alignment."""
+
+    shift_sigma: float
+    """Uncertainty of the journeys' shifts that it assumed [m]; 0 with `paper2017`."""
+    clusters: int
+    singles: int
+    """Signs in no cluster."""
+    changed: int
+    """Signs that left the cluster most of their companions are in, or came to it."""
+
+
+@dataclass(frozen=True)
+class CrowdReport:
+    """What the joint association and alignment saw."""
+
+    rounds: tuple[CrowdRound, ...]
+    spectra: tuple[Spectrum, ...]
+    """Eigenvalues and numbers of clusters of the first clustering, of all signs."""
+    statistics: JourneyStatistics
+    suspects: tuple[SuspectJourney, ...]
+    """Bad drives."""
+    passed: Int[Tensor, " c"]
+    """Journeys that passed by each sign."""
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """Signs of many journeys told apart, and the biases of the journeys."""
+
+    label: Int[Tensor, " n"]
+    """Row of `heads` for each journey's sign; -1 for singles."""
+    heads: Signs
+    """The cluster heads, with the probability that they exist."""
+    tentative: Signs
+    """Singles with their bias taken off, confidence below 0.5: row k is the k-th sign labelled -1."""
+    bias: JourneyBias
+    journey_weight: Float[Tensor, " j"]
+    """1; 0 for bad drives, which had no say in the heads and biases of others."""
+    report: CrowdReport
+
+
+def associate_crowd(
+    crowd: CrowdSigns, config: CrowdConfig, *, generator: torch.Generator | None = None
+) -> Crowd:
+    """The signs of all journeys in clusters, one for each physical sign, and the bias of each journey (V-A.1, V-B)."""
+    if generator is None:
+        generator = torch.Generator().manual_seed(0)
+    associate = _associate_paper if config.method == "paper2017" else _associate_joint
+    return associate(crowd, config, generator)
+
+
+def unbiased_signs(crowd: CrowdSigns, bias: JourneyBias) -> Signs:
+    """Each journey's signs with its bias taken off."""
+    signs = crowd.signs
+    return moved(signs, -bias_at(bias, signs.journey, crowd.station, signs.center_world))
+
+
+def with_covariance(signs: Signs, extra: Float[Tensor, "n 3 3"]) -> Signs:
+    """The same signs, `extra` [m^2] less certain."""
+    return replace(signs, covariance=signs.covariance + extra)
+
+
+def unexplained_covariance(crowd: CrowdSigns, sigma: Float[Tensor, " 3"]) -> Float[Tensor, "n 3 3"]:
+    """What is missing from the covariance of each sign for 1-sigmas of `sigma` [m] along its viewing axes."""
+    axes = crowd.viewing_axes
+    own = (axes.mT @ crowd.signs.covariance @ axes).diagonal(dim1=1, dim2=2)
+    missing = (sigma.square() - own).clamp_min(0)
+    return axes @ torch.diag_embed(missing) @ axes.mT
+
+
+def miss_sigma(
+    crowd: CrowdSigns, unbiased: Signs, label: Int[Tensor, " n"], heads: Signs
+) -> Float[Tensor, " 3"]:
+    """Robust 1-sigma of what signs miss their clusters by along their viewing axes [m]; zero if there are none."""
+    used = label >= 0
+    miss = unbiased.center_world[used] - heads.center_world[label[used]]
+    if not len(miss):
+        return miss.new_zeros(3)
+    along = (crowd.viewing_axes[used].mT @ miss[..., None])[..., 0]
+    return 1.4826 * along.abs().median(0).values
+
+
+def _associate_paper(crowd: CrowdSigns, config: CrowdConfig, generator: torch.Generator) -> Crowd:
+    signs = crowd.signs
+    cluster = replace(config.cluster, method="paper2017")
+    align = replace(config.align, method="paper2017")
+    bias = no_bias(signs, crowd.station, align, journeys=crowd.journeys)
+    label = torch.full_like(signs.journey, -1)
+    rounds: list[CrowdRound] = []
+    spectra: tuple[Spectrum, ...] = ()
+    for _ in range(config.rounds):
+        found = cluster_signs(unbiased_signs(crowd, bias), cluster, generator=generator)
+        spectra = spectra or found.report.spectra
+        rounds.append(_round(0.0, label, found.label))
+        stands_still = same_partition(label, found.label)
+        label = found.label
+        if stands_still:
+            break
+        bias = align_journeys(
+            signs, label, crowd.station, align, start=bias, bias_sigma=crowd.bias_sigma
+        )
+    unbiased = unbiased_signs(crowd, bias)
+    heads = sign_heads(unbiased, label, method="paper2017")
+    company = has_company(crowd, config.existence)
+    statistics = _statistics(crowd, unbiased, label, heads, bias, company)
+    weight = crowd.bias_sigma.new_ones(crowd.journeys)
+    return _finished(crowd, label, heads, bias, (), weight, rounds, spectra, statistics, config)
+
+
+def _associate_joint(crowd: CrowdSigns, config: CrowdConfig, generator: torch.Generator) -> Crowd:
+    signs, journeys = crowd.signs, crowd.journeys
+    votes = vote_biases(
+        signs, config.vote, journeys=journeys, bias_sigma=crowd.bias_sigma, generator=generator
+    )
+    bias = no_bias(signs, crowd.station, config.align, journeys=journeys)
+    bias = replace(bias, translation=votes.translation)
+    weight = crowd.bias_sigma.new_ones(journeys)
+    label = torch.full_like(signs.journey, -1)
+    rounds: list[CrowdRound] = []
+    spectra: tuple[Spectrum, ...] = ()
+    suspects: tuple[SuspectJourney, ...] = ()
+    statistics = None
+    company = has_company(crowd, config.existence)
+    least = signs.size.new_tensor(config.least_sigma_m)
+    extra = unexplained_covariance(crowd, least)
+    for shift_sigma in config.shift_sigmas_m:
+        for _ in range(config.rounds):
+            before = label
+            label, certainty, spectrum = _regroup(
+                with_covariance(unbiased_signs(crowd, bias), extra),
+                label,
+                crowd.seen_together,
+                weight[signs.journey],
+                shift_sigma,
+                config,
+                generator,
+            )
+            spectra = spectra or spectrum
+            rounds.append(_round(shift_sigma, before, label))
+            bias = align_journeys(
+                with_covariance(signs, extra),
+                label,
+                crowd.station,
+                config.align,
+                start=bias,
+                bias_sigma=crowd.bias_sigma,
+                journey_weight=weight,
+                certainty=certainty,
+            )
+            if rounds[-1].changed <= config.stands_still * len(label):
+                break
+        unbiased = unbiased_signs(crowd, bias)
+        heads = rough_heads(with_covariance(unbiased, extra), label, weight=weight[signs.journey])
+        sigma = miss_sigma(crowd, unbiased, label, heads)
+        extra = unexplained_covariance(crowd, torch.maximum(least, sigma))
+        statistics = _statistics(crowd, unbiased, label, heads, bias, company)
+        suspects = suspect_journeys(statistics, config.suspect)
+        weight = torch.ones_like(weight)
+        weight[[s.journey for s in suspects]] = 0
+    assert statistics is not None
+    least_journeys = min(config.min_journeys, journeys)
+    if least_journeys < 2:
+        rest = label < 0
+        label = torch.where(rest, int(label.max()) + rest.cumsum(0), label)
+    label = without_small(
+        signs.journey, label, min_journeys=least_journeys, counts=weight[signs.journey] > 0
+    )
+    unbiased = with_covariance(unbiased_signs(crowd, bias), extra)
+    heads = rough_heads(unbiased, label, weight=weight[signs.journey])
+    sigma = least.new_full((3,), config.shift_sigmas_m[-1])
+    label = merge_heads(
+        unbiased, label, heads, crowd.seen_together, config.match, shift_sigma=sigma
+    )
+    label = renumber(label)
+    heads = rough_heads(unbiased, label, weight=weight[signs.journey])
+    label = harvest_signs(unbiased, label, heads, crowd.seen_together, config.match)
+    label = renumber(label)
+    heads = sign_heads(unbiased, label, weight=weight[signs.journey])
+    return _finished(
+        crowd, label, heads, bias, suspects, weight, rounds, spectra, statistics, config
+    )
+
+
+def _regroup(
+    signs: Signs,
+    label: Int[Tensor, " n"],
+    seen_together: Int[Tensor, "p 2"],
+    weight: Float[Tensor, " n"],
+    shift_sigma: float,
+    config: CrowdConfig,
+    generator: torch.Generator,
+) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"], tuple[Spectrum, ...]]:
+    """New labels, how certain each is, and the spectrum of the clustering of what was in no cluster.
+
+    What is left over is clustered, clusters that are one are merged, and each journey is matched with the heads again.
+    """
+    sigma = signs.size.new_full((3,), shift_sigma)
+    rest = torch.nonzero(label < 0)[:, 0]
+    found = cluster_signs(signs[rest], config.cluster, generator=generator, shift_sigma=sigma)
+    fresh = torch.full_like(label, -1)
+    fresh[rest] = found.label
+    fresh = split_by_conflicts(signs.journey, fresh, seen_together)
+    used = int(label.max()) + 1 if len(label) else 0
+    label = renumber(torch.where(fresh >= 0, fresh + used, label))
+    heads = rough_heads(signs, label, weight=weight, shift_sigma=shift_sigma)
+    matches = match_signs(signs, heads, seen_together, config.match, shift_sigma=sigma)
+    for _ in range(2):
+        before = label = renumber(matches.label)
+        heads = rough_heads(signs, label, weight=weight, shift_sigma=shift_sigma)
+        label = merge_heads(signs, label, heads, seen_together, config.match, shift_sigma=sigma)
+        if not torch.equal(before, label):
+            label = renumber(label)
+            heads = rough_heads(signs, label, weight=weight, shift_sigma=shift_sigma)
+        matches = match_signs(signs, heads, seen_together, config.match, shift_sigma=sigma)
+        if torch.equal(matches.label, label):
+            break
+    label = without_small(signs.journey, matches.label, min_journeys=2)
+    return label, matches.certainty, found.report.spectra
+
+
+def _round(shift_sigma: float, before: Int[Tensor, " n"], after: Int[Tensor, " n"]) -> CrowdRound:
+    now, then, size = distinct_pairs(after, before)
+    clusters = int(after.max()) + 1 if len(after) else 0
+    # Of the members of each cluster, those that were together before; a label of -1 was no company.
+    together = (now >= 0) == (then >= 0)
+    main = size.new_zeros(clusters + 1)
+    main = main.scatter_reduce(0, now[together] + 1, size[together], "amax")
+    return CrowdRound(
+        shift_sigma=shift_sigma,
+        clusters=clusters,
+        singles=int((after < 0).sum()),
+        changed=len(after) - int(main.sum()),
+    )
+
+
+def _statistics(
+    crowd: CrowdSigns,
+    unbiased: Signs,
+    label: Int[Tensor, " n"],
+    heads: Signs,
+    bias: JourneyBias,
+    company: Bool[Tensor, " n"],
+) -> JourneyStatistics:
+    drift = largest_drift(bias)
+    return journey_statistics(unbiased, label, heads, company, bias.translation, drift, crowd.leap)
+
+
+def _finished(
+    crowd: CrowdSigns,
+    label: Int[Tensor, " n"],
+    heads: Signs,
+    bias: JourneyBias,
+    suspects: tuple[SuspectJourney, ...],
+    weight: Float[Tensor, " j"],
+    rounds: list[CrowdRound],
+    spectra: tuple[Spectrum, ...],
+    statistics: JourneyStatistics,
+    config: CrowdConfig,
+) -> Crowd:
+    passed = passing_journeys(crowd, label, len(heads), config.existence)
+    confidence = existence(heads.n_journeys, passed, config.existence).to(heads.size)
+    single = label < 0
+    tentative = unbiased_signs(crowd, bias)[single]
+    low = torch.full_like(tentative.confidence, config.existence.tentative)
+    return Crowd(
+        label=label,
+        heads=replace(heads, confidence=confidence),
+        tentative=replace(tentative, confidence=torch.minimum(low, tentative.confidence)),
+        bias=bias,
+        journey_weight=weight,
+        report=CrowdReport(
+            rounds=tuple(rounds),
+            spectra=spectra,
+            statistics=statistics,
+            suspects=suspects,
+            passed=passed,
+        ),
+    )

@@ -1,0 +1,131 @@
+"""The signs of a crowd: every journey's own triangulations in one table, with when and from where each was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import pairs_within
+from crowdmap_torch.observations import station as along_track
+from crowdmap_torch.tables import Journey, Signs, Tracklets
+
+_FASTEST_MPS = 70.0
+"""No car is faster [m/s]: a longer step between two frames is a fault of the positions."""
+
+
+@dataclass(frozen=True)
+class CrowdSigns:
+    """The signs of all journeys, and what is known about when each was seen."""
+
+    signs: Signs
+    """Each journey's own triangulations, as measured."""
+    station: Float[Tensor, " n"]
+    """Distance driven to where the sign was closest [m]."""
+    view_position: Float[Tensor, "n 3"]
+    """The camera where the sign was closest, as measured [m]."""
+    view_direction: Float[Tensor, "n 3"]
+    """Where it looked."""
+    seen_together: Int[Tensor, "p 2"]
+    """Pairs of signs of one journey that were seen in one same frame: never one sign."""
+    leap: Float[Tensor, " j"]
+    """Largest step between two frames of each journey beyond what a car can drive [m]."""
+    bias_sigma: Float[Tensor, "j 3"]
+    """Prior 1-sigma of each journey's bias, east north up [m]."""
+    path_journey: Int[Tensor, " q"]
+    """Journey of each sample of the paths driven."""
+    path_position: Float[Tensor, "q 3"]
+    """Camera positions every few metres, as measured [m]."""
+    path_direction: Float[Tensor, "q 3"]
+    """Where the camera looked."""
+
+    @property
+    def journeys(self) -> int:
+        """How many journeys there are."""
+        return len(self.bias_sigma)
+
+    @property
+    def viewing_axes(self) -> Float[Tensor, "n 3 3"]:
+        """Columns: horizontally along the camera's axis where each sign was closest, across it, and up."""
+        level = self.view_direction * self.view_direction.new_tensor([1.0, 1.0, 0.0])
+        along = torch.nn.functional.normalize(level, dim=1)
+        up = torch.zeros_like(along)
+        up[:, 2] = 1
+        return torch.stack((along, torch.linalg.cross(up, along), up), dim=2)
+
+
+def gather_signs(
+    journeys: Sequence[Journey],
+    tracklets: Sequence[Tracklets],
+    signs: Signs,
+    *,
+    bias_sigma_m: tuple[float, float, float],
+    path_step_m: float = 4.0,
+) -> CrowdSigns:
+    """The signs of all journeys with when each was seen.
+
+    `signs.journey` and `signs.tracklet` index the two sequences. `bias_sigma_m` is the prior 1-sigma of a bias, east north
+    up [m], where the poses of a journey do not say.
+    """
+    frame_offset = 0
+    station = signs.confidence.new_zeros(len(signs))
+    view = signs.T_world_sign.new_zeros(len(signs), 4, 4)
+    frame_key, seen_sign = [], []
+    leap = station.new_zeros(len(journeys))
+    sigma = station.new_tensor(bias_sigma_m).repeat(len(journeys), 1)
+    path: list[tuple[Tensor, Tensor, Tensor]] = []
+    for j, (journey, found) in enumerate(zip(journeys, tracklets, strict=True)):
+        rows = torch.nonzero(signs.journey == j)[:, 0]
+        distance = along_track(journey.T_world_camera)
+        leap[j] = _largest_leap(journey)
+        frame = signs.frame[rows]
+        station[rows] = distance[frame]
+        view[rows] = journey.T_world_camera[frame]
+        row_of = torch.full((max(found.count, 1),), -1, dtype=rows.dtype, device=rows.device)
+        row_of[signs.tracklet[rows]] = rows
+        seen = torch.where(found.label >= 0, row_of[found.label.clamp_min(0)], -1)
+        frame_key.append(frame_offset + journey.signs.frame[seen >= 0])
+        seen_sign.append(seen[seen >= 0])
+        frame_offset += journey.frame_count
+        if journey.sigma_position is not None:
+            sigma[j] = journey.sigma_position.median(0).values.clamp_min(0.05)
+        if journey.frame_count:
+            step = (distance / path_step_m).floor()
+            sampled = torch.cat((step.new_ones(1, dtype=torch.bool), step.diff() > 0))
+            T = journey.T_world_camera[sampled]
+            owner = torch.full((len(T),), j, dtype=rows.dtype, device=rows.device)
+            path.append((owner, T[:, :3, 3], T[:, :3, 2]))
+    owner, position, direction = (torch.cat(c) for c in zip(*path, strict=True))
+    return CrowdSigns(
+        signs=signs,
+        station=station,
+        view_position=view[:, :3, 3],
+        view_direction=view[:, :3, 2],
+        seen_together=pairs_seen_together(torch.cat(seen_sign), torch.cat(frame_key), len(signs)),
+        leap=leap,
+        bias_sigma=sigma,
+        path_journey=owner,
+        path_position=position,
+        path_direction=direction,
+    )
+
+
+def pairs_seen_together(
+    sign: Int[Tensor, " d"], frame: Int[Tensor, " d"], n: int
+) -> Int[Tensor, "p 2"]:
+    """Pairs of the `n` signs that share a frame; `frame` numbers the frames of all journeys on."""
+    first, second = sign[pairs_within(frame)].T
+    low, high = torch.minimum(first, second), torch.maximum(first, second)
+    key = torch.unique((low * n + high)[low != high])
+    return torch.stack((key // max(n, 1), key % max(n, 1)), dim=1)
+
+
+def _largest_leap(journey: Journey) -> Float[Tensor, ""]:
+    position = journey.T_world_camera[:, :3, 3]
+    step = position.diff(dim=0).norm(dim=1)
+    seconds = journey.t_ns.diff().to(step) * 1e-9
+    beyond = (step - _FASTEST_MPS * seconds).clamp_min(0)
+    return torch.cat((beyond, beyond.new_zeros(1))).max()

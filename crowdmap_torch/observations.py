@@ -1,0 +1,169 @@
+"""Rows of bundle adjustment: every sign corner and lane point of all journeys, with its pose, landmark and observation matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.geometry import camera, polygon
+from crowdmap_torch.tables import Association, Journey, RoadEstimate, Rows, Signs, concatenate
+
+_CURVATURE = 1e-3
+"""Vertical curvature of roads [1/m] that the plane under the car leaves out: a crest of 1 km radius."""
+
+
+@dataclass(frozen=True)
+class CornerObservations(Rows):
+    """Sign corners seen in frames."""
+
+    frame: Int[Tensor, " m"]
+    """Frame, counted over all journeys."""
+    sign: Int[Tensor, " m"]
+    template: Float[Tensor, "m 2"]
+    """The corner for width and height one, on the sign's plane."""
+    matrix: Float[Tensor, "m 3 3"]
+    """Observation matrix (geometry.camera)."""
+
+
+@dataclass(frozen=True)
+class LanePointObservations(Rows):
+    """Lane points seen in frames."""
+
+    frame: Int[Tensor, " m"]
+    journey: Int[Tensor, " m"]
+    detection: Int[Tensor, " m"]
+    """Lane detection of the journey."""
+    ideal: Float[Tensor, "m 2"]
+    matrix: Float[Tensor, "m 3 3"]
+    normal_camera: Float[Tensor, "m 3"]
+    """The road's normal in that frame."""
+    camera_height: Float[Tensor, " m"]
+    height_sigma: Float[Tensor, " m"]
+    """How well the road tells the height of this point [m]."""
+
+
+def frame_offsets(journeys: Sequence[Journey]) -> list[int]:
+    """Number of frames before each journey, and in the end of all."""
+    offsets = [0]
+    for journey in journeys:
+        offsets.append(offsets[-1] + journey.frame_count)
+    return offsets
+
+
+def station(T_world_camera: Float[Tensor, "f 4 4"], *, half_window: int = 7) -> Float[Tensor, " f"]:
+    """Distance travelled up to each frame [m], from positions smoothed over about a second.
+
+    The white noise of positions would add metres while a car stands at a light.
+    """
+    position = T_world_camera[:, :3, 3]
+    last = len(position) - 1
+    index = torch.arange(len(position), device=position.device)
+    ahead, behind = (index + half_window).clamp_max(last), (index - half_window).clamp_min(0)
+    speed = (position[ahead] - position[behind]).norm(dim=-1) / (ahead - behind).clamp_min(1)
+    return torch.cat((speed.new_zeros(1), ((speed[1:] + speed[:-1]) / 2).cumsum(0)))[: last + 1]
+
+
+def corner_observations(
+    journeys: Sequence[Journey], associations: Sequence[Association], signs: Signs
+) -> CornerObservations:
+    """Corners of the detections that show a sign of the map, where the shapes agree."""
+    offsets = frame_offsets(journeys)
+    return concatenate(
+        [
+            _corners(journey, association, signs, offset)
+            for journey, association, offset in zip(journeys, associations, offsets, strict=False)
+        ]
+    )
+
+
+def _corners(
+    journey: Journey, association: Association, signs: Signs, offset: int
+) -> CornerObservations:
+    detections = journey.signs
+    used = torch.nonzero(association.sign >= 0)[:, 0]
+    used = used[detections.shape[used] == signs.shape[association.sign[used]]]
+    sign, shape = association.sign[used], detections.shape[used]
+    count = polygon.corner_count(shape)
+    slot = torch.arange(polygon.MAX_CORNERS, device=shape.device)
+    shifted = (slot + association.sign_shift[used][:, None]) % count[:, None]
+    at = shifted[..., None].expand(-1, -1, 2)
+    px, ideal = (
+        corners[used].gather(1, at) for corners in (detections.corners_px, detections.corners_ideal)
+    )
+    row, corner = torch.nonzero(polygon.corner_mask(shape), as_tuple=True)
+    return CornerObservations(
+        frame=detections.frame[used][row] + offset,
+        sign=sign[row],
+        template=polygon.template(shape)[row, corner],
+        matrix=camera.observation_matrix(journey.rig.camera, px[row, corner], ideal[row, corner]),
+    )
+
+
+def lane_point_observations(
+    journeys: Sequence[Journey],
+    roads: Sequence[RoadEstimate],
+    *,
+    keyframe_spacing: float,
+    points_per_detection: int,
+    height_sigma: float,
+) -> LanePointObservations:
+    """Points of lane detections in frames at least `keyframe_spacing` [m] apart, evenly thinned.
+
+    The height that the road gives a point is trusted to `height_sigma` [m] under the car, and less further ahead, where
+    the normal's own error and the road's curvature tell.
+    """
+    offsets = frame_offsets(journeys)
+    tables = []
+    for number, (journey, road, offset) in enumerate(zip(journeys, roads, offsets, strict=False)):
+        cell = (station(journey.T_world_camera) / keyframe_spacing).floor()
+        key = torch.ones_like(cell, dtype=torch.bool)
+        key[1:] = cell[1:] != cell[:-1]
+        points = journey.lane_points
+        rank = _rank_within(points.detection)
+        count = torch.bincount(points.detection, minlength=len(journey.lanes))[points.detection]
+        # Evenly spread ranks: kept where the scaled rank passes an integer.
+        wanted = count.clamp_max(points_per_detection)
+        thin = (rank * wanted) // count != ((rank - 1) * wanted).div(count, rounding_mode="floor")
+        use = thin & key[journey.lanes.frame[points.detection]]
+        points = points[use]
+        frame = journey.lanes.frame[points.detection]
+        normal, height = road.normal_camera[frame], road.height[frame]
+        ray = torch.nn.functional.pad(points.ideal, (0, 1), value=1.0)
+        distance = height / (normal * ray).sum(-1).clamp_min(1e-3)
+        slope = road.sigma[frame] + distance * _CURVATURE
+        tables.append(
+            LanePointObservations(
+                frame=frame + offset,
+                journey=torch.full_like(points.detection, number),
+                detection=points.detection,
+                ideal=points.ideal,
+                matrix=camera.observation_matrix(journey.rig.camera, points.px, points.ideal),
+                normal_camera=normal,
+                camera_height=height,
+                height_sigma=(height_sigma**2 + (slope * distance).square()).sqrt(),
+            )
+        )
+    return concatenate(tables)
+
+
+def spaced_frames(journey: Journey, used: Bool[Tensor, " f"], spacing: float) -> Bool[Tensor, " f"]:
+    """The used frames, thinned to one per `spacing` metres of travel: a car at a light sees one picture."""
+    index = torch.nonzero(used)[:, 0]
+    cell = (station(journey.T_world_camera)[index] / spacing).floor()
+    first = torch.ones_like(cell, dtype=torch.bool)
+    first[1:] = cell[1:] != cell[:-1]
+    kept = torch.zeros_like(used)
+    kept[index[first]] = True
+    return kept
+
+
+def _rank_within(group: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
+    """Position of each row among the adjacent rows of its group."""
+    index = torch.arange(len(group), device=group.device)
+    first = torch.ones_like(group, dtype=torch.bool)
+    first[1:] = group[1:] != group[:-1]
+    return index - index[first][first.cumsum(0) - 1]

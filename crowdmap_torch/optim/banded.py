@@ -1,0 +1,37 @@
+"""Linear least squares whose every equation touches a few neighbouring unknowns: chains, smooth curves."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.linalg import solveh_banded
+from torch import Tensor
+
+
+def solve_banded(
+    start: Int[Tensor, " m"],
+    row: Float[Tensor, "m k"],
+    target: Float[Tensor, "m r"],
+    weight: Float[Tensor, " m"],
+    count: int,
+) -> Float[Tensor, "count r"]:
+    """The unknowns x that minimise the weighted squares of `sum_j row[:, j] x[start + j] - target`.
+
+    Unknowns of independent problems may stand one behind the other: without an equation that touches both they do not
+    mix. Every unknown needs an equation. Columns of `target` are solved for at once.
+    """
+    width = row.shape[1]
+    band = row.new_zeros(width, count)
+    rhs = row.new_zeros(count, target.shape[1])
+    weighted = row * weight[:, None]
+    for j in range(width):
+        # Rows near the end may reach behind the last unknown with coefficients of zero.
+        at = (start + j).clamp_max(count - 1)
+        rhs.index_add_(0, at, weighted[:, j, None] * target)
+        for i in range(j, width):
+            band[i - j].index_add_(0, at, weighted[:, j] * row[:, i])
+    solution = solveh_banded(
+        band.detach().cpu().numpy(), rhs.detach().cpu().numpy(), lower=True, check_finite=False
+    )
+    return torch.from_numpy(np.ascontiguousarray(solution)).to(row)

@@ -1,0 +1,184 @@
+"""The paper's online adjustment of the road normal: the candidate that makes the road most nearly a plane (IV-C, eq:rne).
+
+With the points `w = c_n + R_n v_i(n)` of the paper, v_i the fixed rays cut at the candidate plane, the scatter matrix of
+a segment needs the mean and the second moments of the v_i only: the fixed points never meet the poses one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.func import grad, jvp
+
+from crowdmap_torch.geometry.plane import harmonic_mean_singular_value, smallest_singular_value
+from crowdmap_torch.road.level import Level
+
+COSTS = {
+    "smallest_singular_value": smallest_singular_value,
+    "harmonic_mean": harmonic_mean_singular_value,
+}
+
+
+@dataclass(frozen=True)
+class CoplanarityConfig:
+    """The online adjustment exactly as in the paper (IV-C, eq:rne)."""
+
+    cost: str = "smallest_singular_value"
+    """Of a segment's scatter matrix; or `harmonic_mean` of the singular values, the cheaper surrogate."""
+    segment_m: float = 20.0
+    """Length of the segments over which the road counts as planar."""
+    segments: int = 10
+    """Most recent segments in the sum."""
+    min_segments: int = 3
+    """Fewer than these do not start an adjustment."""
+    poses: int = 16
+    """Poses of a segment, equally spaced."""
+    update_m: float = 30.0
+    """The normal is estimated anew after so much travel."""
+    points_right: tuple[float, ...] = (-0.5, -0.25, 0.0, 0.25, 0.5)
+    """Fixed points below the horizon: on the plane z = 1 of the calibrated road frame, to the right."""
+    points_down: tuple[float, ...] = (0.1, 0.15, 0.225, 0.35)
+    """Likewise, below the calibrated horizon."""
+    iterations: int = 12
+    """Of damped Newton steps."""
+
+    def __post_init__(self) -> None:
+        if self.cost not in COSTS:
+            raise ValueError(f"cost: expected one of {', '.join(COSTS)}, found {self.cost!r}")
+
+
+@dataclass(frozen=True)
+class PoseNodes:
+    """Poses picked at equal distances along the way, at most one for each cell of it."""
+
+    cell: Int[Tensor, " n"]
+    """Increasing; `poses` cells make up a segment."""
+    R_world_road: Float[Tensor, "n 3 3"]
+    position: Float[Tensor, "n 3"]
+
+    @property
+    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        """All of them."""
+        return self.cell, self.R_world_road, self.position
+
+    def __getitem__(self, index: Tensor) -> PoseNodes:
+        return PoseNodes(*(column[index] for column in self.columns))
+
+
+@dataclass(frozen=True)
+class NormalUpdates:
+    """Normals estimated along a drive."""
+
+    frame: Int[Tensor, " u"]
+    """Frame from which on each of them is known."""
+    alpha: Float[Tensor, " u"]
+    beta: Float[Tensor, " u"]
+    sigma: Float[Tensor, " u"]
+    """1-sigma of the normal's angle, from the curvature of the cost [rad]; infinite where the cost does not decide."""
+
+
+def pick_nodes(
+    level: Level, station: Float[Tensor, " f+1"], config: CoplanarityConfig
+) -> PoseNodes:
+    """The first pose in each cell that frames newly enter; `station` holds that of the frame before them, too."""
+    cell = (station * (config.poses / config.segment_m)).floor().long()
+    enters = cell[1:] > cell[:-1]
+    return PoseNodes(cell[1:][enters], level.R_world_road[enters], level.position[enters])
+
+
+def coplanar_normals(
+    nodes: PoseNodes,
+    frame: Int[Tensor, " u"],
+    station: Float[Tensor, " u"],
+    height: float,
+    config: CoplanarityConfig,
+) -> NormalUpdates:
+    """The normals at frames whose stations are given, each from the segments completed before it (eq:rne)."""
+    last = (station / config.segment_m).floor().long()
+    slot = torch.arange(config.segments, device=frame.device)
+    segment = last[:, None] - 1 - slot
+    index, present = _rows(nodes, segment, config.poses)
+    # A segment with few poses (the first after a gap in the frames) says nothing about a plane.
+    present = present & (present.sum(-1, keepdim=True) >= config.poses // 2)
+    complete = present.any(-1)
+    enough = complete.sum(-1) >= config.min_segments
+    frame, index, present = frame[enough], index[enough], present[enough]
+    R = nodes.R_world_road[index]
+    c = nodes.position[index]
+    weight = present.to(c)
+    number = weight.sum(-1)[..., None, None].clamp_min(1)
+    c = c - (weight[..., None] * c).sum(-2, keepdim=True) / number
+    rays = torch.cartesian_prod(c.new_tensor(config.points_right), c.new_tensor(config.points_down))
+    rays = torch.cat((rays, torch.ones_like(rays[:, :1])), dim=-1)
+    singular = COSTS[config.cost]
+
+    def costs(tilt: Float[Tensor, "u 2"]) -> Float[Tensor, " u"]:
+        n = torch.nn.functional.normalize(
+            torch.stack((tilt[:, 1], torch.ones_like(tilt[:, 0]), tilt[:, 0]), dim=-1), dim=-1
+        )
+        v = rays * (height / (n @ rays.T))[..., None]
+        mean, square = v.mean(1), (v[..., :, None] * v[..., None, :]).mean(1)
+        seen = c + (R @ mean[:, None, None, :, None])[..., 0]
+        spread = R @ (square - mean[:, :, None] * mean[:, None, :])[:, None, None] @ R.mT
+        centre = (weight[..., None] * seen).sum(-2, keepdim=True) / number
+        off = seen - centre
+        between = off[..., :, None] * off[..., None, :]
+        S = (weight[..., None, None] * (between + spread)).sum(-3) * len(rays)
+        # Where there is no segment, three distinct values: those of a zero matrix have no derivative.
+        there = present.any(-1)
+        S = torch.where(there[..., None, None], S, torch.diag(S.new_tensor([1.0, 2.0, 3.0])))
+        return torch.where(there, singular(S), 0.0).sum(-1)
+
+    tilt, cost, H = _minimise(costs, c.new_zeros(len(frame), 2), config.iterations)
+    # The points of one pose are all wrong together: poses count, not points.
+    freedom = (present.sum((-1, -2)) - 4 * complete[enough].sum(-1)).clamp_min(1)
+    eigenvalue, V = torch.linalg.eigh(H)
+    inverse = V @ ((1 / eigenvalue.clamp_min(1e-12))[..., None] * V.mT)
+    variance = 2 * (cost / freedom)[:, None, None] * inverse
+    sigma = variance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    sigma = torch.where(eigenvalue[:, 0] > 0, sigma, torch.inf)
+    return NormalUpdates(frame, tilt[:, 0], tilt[:, 1], sigma)
+
+
+def _rows(
+    nodes: PoseNodes, segment: Int[Tensor, "u g"], poses: int
+) -> tuple[Int[Tensor, "u g p"], Tensor]:
+    """Row of the node in each cell of segments, and which of them there are."""
+    cell = segment[..., None] * poses + torch.arange(poses, device=segment.device)
+    row = torch.searchsorted(nodes.cell, cell).clamp_max(max(len(nodes.cell) - 1, 0))
+    return row, (nodes.cell[row] == cell) & (cell >= 0)
+
+
+def _minimise(costs, start: Float[Tensor, "u 2"], iterations: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Minima of independent functions of two variables by damped Newton steps; values and Hessians there."""
+
+    def slope_and_curvature(x: Tensor) -> tuple[Tensor, Tensor]:
+        slope = grad(lambda y: costs(y).sum())
+        columns = []
+        for k in range(2):
+            direction = torch.zeros_like(x)
+            direction[:, k] = 1
+            g, column = jvp(slope, (x,), (direction,))
+            columns.append(column)
+        H = torch.stack(columns, dim=-1)
+        return g, 0.5 * (H + H.mT)
+
+    x, value = start, costs(start)
+    damping = torch.full_like(value, 1e-3)
+    for _ in range(iterations):
+        g, H = slope_and_curvature(x)
+        eigenvalue, V = torch.linalg.eigh(H)
+        # Uphill curvature is walked down all the same; the damping is relative to the larger of the two.
+        bounded = eigenvalue.abs() + damping[:, None] * eigenvalue.abs().amax(-1, keepdim=True)
+        step = -(V @ ((V.mT @ g[..., None])[..., 0] / bounded.clamp_min(1e-12))[..., None])[..., 0]
+        step = step * (0.02 / step.norm(dim=-1, keepdim=True).clamp_min(0.02))
+        new = costs(x + step)
+        better = new < value
+        x = torch.where(better[:, None], x + step, x)
+        value = torch.where(better, new, value)
+        damping = torch.where(better, damping / 4, damping * 8).clamp(1e-9, 1e6)
+    _, H = slope_and_curvature(x)
+    return x, value, H

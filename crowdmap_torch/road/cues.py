@@ -1,0 +1,193 @@
+"""What poses and lane markers say about the road's slopes and the car's stance, frame by frame (for `road.filter`).
+
+Only the past is looked at: frames can come in one at a time or all at once, with the same result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.road.filter import (
+    CROSS,
+    GROWTH,
+    MISSING,
+    ROLL,
+    SLOPE,
+    STANCE,
+    STATE_SIZE,
+    TWIST,
+    Measurements,
+)
+from crowdmap_torch.road.level import Level
+from crowdmap_torch.road.vanishing import LaneRays, VanishingConfig, VanishingFit
+
+
+@dataclass(frozen=True)
+class RoadCueConfig:
+    """How far each cue can be trusted; pairs are (pitch, roll), angles in radians."""
+
+    shaking: tuple[float, float] = (2.5e-3, 1.3e-3)
+    """1-sigma of the springs' pitch and roll."""
+    shaking_memory_s: float = 0.2
+    """Time after which the springs have forgotten it."""
+    rotation_sigma: float = 4e-4
+    """White noise of the measured rotation from frame to frame."""
+    parallel_sigma: float = 1.5e-3
+    """What is wrong with a frame's vanishing point besides the points' noise: markers are not quite parallel."""
+    chord_m: float = 20.0
+    """Travel after which the slope of the way itself is looked at."""
+    chord_sigma: float = 1.1e-2
+    """1-sigma of it, from the drift of positions over that way and that of rotations over much longer ways."""
+    width_m: float = 100.0
+    """Travel after which the widths of neighbouring lanes are compared."""
+    width_sigma: float = 0.025
+    """1-sigma of a lane's width against its neighbours', as a share of it."""
+    width_range_m: tuple[float, float] = (2.4, 4.6)
+    """Markers so far apart are taken for the two sides of one lane."""
+    vanishing: VanishingConfig = field(default_factory=VanishingConfig)
+
+
+@dataclass(frozen=True)
+class Travel:
+    """What must be remembered from one frame to the next; its size never grows."""
+
+    station: Float[Tensor, ""]
+    """Furthest way ahead since the first frame [m]."""
+    chord_start: Float[Tensor, " 4"]
+    """Position [m] and station [m] where the last chord ended."""
+    widths: Float[Tensor, " 6"]
+    """Sums over the pairs of markers since the last comparison; see `width_moments`."""
+
+
+def no_travel(level: Level) -> Travel:
+    """Before the first of some frames."""
+    start = torch.cat((level.position[0], level.position.new_zeros(1)))
+    return Travel(start[3], start, start.new_zeros(6))
+
+
+def measure(
+    level: Level,
+    dt: Float[Tensor, " f"],
+    fit: VanishingFit,
+    moments: Float[Tensor, "f 6"],
+    travel: Travel,
+    config: RoadCueConfig,
+) -> tuple[Measurements, Travel]:
+    """The measurements of frames that follow on `travel`, and what the frames after them need to know."""
+    frames = len(level)
+    row = dt.new_zeros(frames, 5, STATE_SIZE)
+    known = torch.zeros_like(row)
+    value = dt.new_zeros(frames, 5)
+    variance = torch.full_like(value, MISSING)
+    # The springs shake with a memory: over many frames it averages out more slowly than white noise.
+    longer = (2 * config.shaking_memory_s / dt.clamp_min(1e-3)).clamp_min(1)
+    for k, (slope, stance, seen) in enumerate(
+        ((SLOPE, STANCE, level.alpha), (CROSS, ROLL, level.beta))
+    ):
+        row[:, k, slope], row[:, k, stance] = -1, 1
+        value[:, k] = seen
+        variance[:, k] = config.shaking[k] ** 2 * longer
+
+    row[:, 2, SLOPE] = 1
+    row[:, 2, GROWTH] = fit.by_curvature
+    # A road that bends and leans falls behind its tangent plane.
+    known[:, 2, CROSS] = -fit.by_curvature * fit.bend
+    known[:, 2, TWIST] = fit.by_twist
+    value[:, 2] = fit.alpha - level.alpha
+    noise = fit.variance + config.parallel_sigma**2 + config.rotation_sigma**2
+    variance[:, 2] = torch.where(fit.variance < 0.05**2, noise, MISSING)
+
+    walked = travel.station + level.advance.cumsum(0)
+    station = torch.cummax(torch.cat((travel.station[None], walked)), 0)[0]
+    ends = _passes(station, config.chord_m)
+    rows = ends.nonzero()[:, 0]
+    here = torch.cat((level.position[rows], station[1:][rows, None]), dim=-1)
+    before = torch.cat((travel.chord_start[None], here))
+    way = here - before[:-1]
+    flat = way[:, :2].norm(dim=-1)
+    length = way[:, 3].clamp_min(1e-3)
+    is_straight = flat > 0.5 * length
+    row[rows, 3, SLOPE] = 1
+    row[rows, 3, GROWTH] = -length / 2
+    value[rows, 3] = way[:, 2] / flat.clamp_min(1e-3)
+    # Noise of positions: with the square root of the way, and so does its share in the slope.
+    chord_variance = config.chord_sigma**2 * config.chord_m / length
+    variance[rows, 3] = torch.where(is_straight, chord_variance, MISSING)
+
+    ends = _passes(station, config.width_m)
+    stretch = ends.long().cumsum(0) - ends.long()
+    count = int(ends.sum())
+    total = moments.new_zeros(count + 1, 6).index_add(0, stretch, moments)
+    total[0] += travel.widths
+    rows = ends.nonzero()[:, 0]
+    roll, roll_variance = _roll_of_widths(total[:count], config)
+    row[rows, 4, ROLL] = 1
+    value[rows, 4], variance[rows, 4] = roll, roll_variance
+    after = Travel(station[-1], before[-1], total[count])
+    return Measurements(level.advance, dt, row, known, value, variance), after
+
+
+def _passes(station: Float[Tensor, " f+1"], every: float) -> Bool[Tensor, " f"]:
+    """True for frames in which the way passes a multiple of a length."""
+    index = (station / every).floor()
+    return index[1:] > index[:-1]
+
+
+def width_moments(
+    fit: VanishingFit,
+    rays: LaneRays,
+    height: float,
+    config: RoadCueConfig,
+    beta: Float[Tensor, " f"] | None = None,
+) -> Float[Tensor, "f 6"]:
+    """Sums over neighbouring pairs of markers of 1, p, p^2, l, p l, and 1 for a frame that has any.
+
+    l is the logarithm of the pair's width and p the sum of its two offsets [camera heights]. A camera that rolls by beta against
+    its calibration sees `m + beta m^2` for an offset m, and so widths that grow by beta p from one side to the other. Where a roll
+    `beta` has been taken off already it is put back.
+    """
+    frames = rays.frames
+    # By frame, and from left to right within it.
+    order = fit.offset.argsort()
+    order = order[rays.frame[order].argsort(stable=True)]
+    m, frame, sure = fit.offset[order], rays.frame[order], fit.offset_weight[order] > 1e3
+    width = m[1:] - m[:-1]
+    low, high = (w / height for w in config.width_range_m)
+    is_pair = (frame[1:] == frame[:-1]) & sure[1:] & sure[:-1] & (width > low) & (width < high)
+    place, frame = (m[1:] + m[:-1])[is_pair], frame[1:][is_pair]
+    log_width = width[is_pair].log()
+    if beta is not None:
+        log_width = log_width + beta[frame] * place
+    terms = (torch.ones_like(place), place, place**2, log_width, place * log_width)
+    sums = m.new_zeros(frames, 5).index_add(0, frame, torch.stack(terms, dim=-1))
+    return torch.cat((sums, (sums[:, :1] > 0).to(sums)), dim=-1)
+
+
+def _roll_of_widths(
+    moments: Float[Tensor, "n 6"], config: RoadCueConfig
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Slope of the regression of widths on places, and its variance: every lane is off by its own share, in all frames."""
+    number, p, pp, width, pw, frames = moments.unbind(-1)
+    n = number.clamp_min(1)
+    spread = pp / n - (p / n) ** 2
+    enough = (spread > 0.5) & (number > 20)
+    roll = (pw / n - p / n * width / n) / torch.where(enough, spread, 1.0)
+    lanes = number / frames.clamp_min(1)
+    variance = config.width_sigma**2 / (lanes * spread).clamp_min(1e-9)
+    return roll, torch.where(enough, variance, MISSING)
+
+
+def lane_rays(
+    ideal: Float[Tensor, "p 2"],
+    detection: Int[Tensor, " p"],
+    frame: Int[Tensor, " d"],
+    frames: int,
+    R_road_camera: Float[Tensor, "3 3"],
+) -> LaneRays:
+    """Lane points in the road frame."""
+    ray = torch.nn.functional.pad(ideal, (0, 1), value=1.0) @ R_road_camera.T
+    return LaneRays(detection, frame, frames, ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2])

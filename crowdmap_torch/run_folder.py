@@ -1,0 +1,125 @@
+"""The folder that a run writes: who may write there, and every output that FORMAT.md names."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from crowdmap_torch import __version__
+from crowdmap_torch.config import MapperConfig, dump
+from crowdmap_torch.evaluate import MapFigures, evaluate_map, refuse_other_origin
+from crowdmap_torch.evaluation.evidence import gather_evidence
+from crowdmap_torch.io.atomic import atomic_file, atomic_folder
+from crowdmap_torch.io.landmarks import write_lanes, write_signs
+from crowdmap_torch.io.maps import write_map
+from crowdmap_torch.io.runs import (
+    write_associations,
+    write_metrics,
+    write_refined_poses,
+    write_road,
+)
+from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.tables import Dataset, HdMap, Origin, Survey
+
+
+class RunFolder:
+    """RUN of FORMAT.md. What a finished run left there stays untouched until the new one is complete."""
+
+    def __init__(self, path: Path, *, overwrite: bool = False, resume: bool = False) -> None:
+        """ValueError if there is something already and neither `overwrite` nor `resume` is given."""
+        if path.exists() and not path.is_dir():
+            raise ValueError(f"{path}: is a file; --out names a folder")
+        if path.exists() and any(path.iterdir()) and not (overwrite or resume):
+            raise ValueError(
+                f"{path}: exists already; give --overwrite to replace it or --resume to go on"
+            )
+        self.path = path
+        self.resume = resume
+        self.map = path / "map"
+        self.report = path / "report.html"
+        self.tensorboard = path / "tensorboard"
+        self.checkpoint = path / "checkpoint.pt"
+
+    def prepare(self) -> None:
+        """Makes the folder; without `resume` the events and the checkpoint of an older run go."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        if not self.resume:
+            shutil.rmtree(self.tensorboard, ignore_errors=True)
+            self.checkpoint.unlink(missing_ok=True)
+
+    def write_result(self, dataset: Dataset, result: MapResult, config: MapperConfig) -> None:
+        """The maps, what each journey made, the associations and the configuration."""
+        provenance = {
+            **result.hd_map.provenance,
+            "version": __version__,
+            "created_at": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        }
+        with atomic_folder(self.path / "journeys") as folder:
+            self._write_journeys(folder, dataset, result)
+        write_associations(
+            self.path / "associations.parquet",
+            dataset.journeys,
+            [a.sign for a in result.associations],
+            [a.lane for a in result.associations],
+            sign_id=result.hd_map.sign_id,
+            lane_id=result.hd_map.lane_id,
+        )
+        with atomic_file(self.path / "config.yaml") as beside:
+            beside.write_text(dump(config), encoding="utf-8")
+        for name, hd_map in (("map_clusters", result.map_clusters), ("map", result.hd_map)):
+            write_map(
+                replace(hd_map, provenance=provenance),
+                self.path / name,
+                min_confidence=config.min_confidence,
+            )
+
+    def write_metrics(self, metrics: Mapping[str, object]) -> None:
+        """metrics.json."""
+        write_metrics(self.path / "metrics.json", metrics)
+
+    def _write_journeys(self, folder: Path, dataset: Dataset, result: MapResult) -> None:
+        for journey, made, poses in zip(
+            dataset.journeys, result.journey_maps, result.poses, strict=True
+        ):
+            place = folder / journey.journey_id
+            write_refined_poses(place / "poses.parquet", journey, poses)
+            write_road(place / "road.parquet", journey.frame_number, made.road)
+            signs = [f"{journey.journey_id}-s{i}" for i in made.signs.tracklet.tolist()]
+            write_signs(place / "signs.parquet", made.signs, signs, dataset.type_names)
+            lanes = [f"{journey.journey_id}-l{i}" for i in range(len(made.lanes))]
+            write_lanes(place / "lanes.parquet", made.lanes, lanes)
+
+
+def read_survey_of(dataset_folder: Path, origin: Origin) -> Survey | None:
+    """The dataset's survey, or None if it has none; ValueError if it cannot be read or has another origin."""
+    folder = dataset_folder / "survey"
+    if not folder.exists():
+        return None
+    survey = read_survey(folder)
+    refuse_other_origin(origin, survey.origin)
+    return survey
+
+
+def figures_of(
+    hd_map: HdMap, survey: Survey, dataset_folder: Path, run: RunFolder | None
+) -> MapFigures:
+    """METRICS.md's figures of a map; with a run's folder those of associations and single journeys too."""
+    evidence = gather_evidence(
+        hd_map,
+        survey,
+        dataset_folder / "survey",
+        dataset_folder=dataset_folder,
+        run_folder=None if run is None else run.path,
+    )
+    return evaluate_map(
+        hd_map,
+        survey,
+        truth=evidence.truth,
+        associations=evidence.associations,
+        landmarks=evidence.landmarks,
+        notes=evidence.notes,
+    )

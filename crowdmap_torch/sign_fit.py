@@ -1,0 +1,462 @@
+"""Robust fits of signs to their detections in posed frames (IV-B), all signs at once.
+
+The poses of a journey are not exact, and their error hits all corners of a detection alike: it moves the sign in the image
+and leaves its outline. So one detection is one observation, whitened by its covariance: pixel noise of the corners, and the
+white noise of the pose that all of them share. What drifts slowly along the drive is estimated along with the sign
+(`pose_drift`). A sign is thus placed relative to the pose at its closest view; its size and depth rest on the outlines,
+which no pose error spoils.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch import residuals
+from crowdmap_torch.geometry import polygon, se3
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.linear import DenseBackend
+from crowdmap_torch.optim.linearize import residuals as rows_of_term
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
+from crowdmap_torch.optim.robust import Tukey
+from crowdmap_torch.pose_drift import (
+    DriftConfig,
+    DriftKnots,
+    drift_terms,
+    place_knots,
+    signed_distance,
+)
+from crowdmap_torch.tables import Rows
+
+
+@dataclass(frozen=True)
+class SignFitConfig:
+    """Noise of detections and poses, and what signs are like before anything is seen of them."""
+
+    sigma_px: float = 0.6
+    """Noise of each corner of a large detection, per axis [px]."""
+    small_box_px: float = 12.0
+    """Box at which that noise has grown by a factor of 1.41 [px]."""
+    max_noise_scale: float = 4.0
+    """The noise of each sign's corners is estimated from its own residuals, up to this multiple of the above."""
+    pose_sigma_m: float = 0.016
+    """White noise of positions from frame to frame."""
+    pose_sigma_rad: float = 3.5e-4
+    """White noise of rotations from frame to frame."""
+    drift: DriftConfig = field(default_factory=DriftConfig)
+    """What else the poses do between views."""
+    tukey: float = 2.8
+    """Detections with a root mean square whitened error beyond this many standard deviations have no say."""
+    typical_size_m: float = 0.75
+    """Median width and height of signs."""
+    sigma_log_size: float = 0.8
+    """Spread of the logarithms of width and height."""
+    sigma_facing_rad: float = 0.5
+    """Spread of the angle between a sign's normal and the direction it is driven at."""
+    sigma_upright_rad: float = 0.1
+    """Spread of roll and tilt."""
+    rounds: int = 2
+    """How often the views' own pose errors are estimated and the fit is repeated."""
+    lm: lm.LmConfig = field(
+        default_factory=lambda: lm.LmConfig(max_iterations=30, cost_tolerance=1e-4)
+    )
+
+
+@dataclass(frozen=True)
+class SignViews(Rows):
+    """Detections of signs, corners in the order of the sign's template."""
+
+    sign: Int[Tensor, " m"]
+    """Row of the sign that each detection shows."""
+    part: Int[Tensor, " m"]
+    """Pass of the sign, counted over all signs: views of one pass share a drift."""
+    frame: Int[Tensor, " m"]
+    t_s: Float[Tensor, " m"]
+    """Time since the journey began [s]."""
+    corners_px: Float[Tensor, "m 8 2"]
+    corners_ideal: Float[Tensor, "m 8 2"]
+    observation: Float[Tensor, "m 8 3 3"]
+    T_world_camera: Float[Tensor, "m 4 4"]
+
+    @property
+    def p_world_camera(self) -> Float[Tensor, "m 3"]:
+        """Where each view was taken from."""
+        return self.T_world_camera[:, :3, 3]
+
+
+@dataclass(frozen=True)
+class SignStart:
+    """Where a fit begins."""
+
+    T_world_sign: Float[Tensor, "n 4 4"]
+    size: Float[Tensor, "n 2"]
+
+
+@dataclass(frozen=True)
+class SignFit:
+    """Signs fitted to views."""
+
+    T_world_sign: Float[Tensor, "n 4 4"]
+    size: Float[Tensor, "n 2"]
+    cost: Float[Tensor, " n"]
+    covariance: Float[Tensor, "n 3 3"]
+    """Of the centre, relative to the pose at the closest view [m^2]."""
+    error_sq: Float[Tensor, " m"]
+    """Mean square of each view's whitened error; views beyond `tukey` squared have no say."""
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """What is known of the noise of every view; of a shape with C corners the leading 2 C entries count."""
+
+    whitening: Float[Tensor, "m 16 16"]
+    """Inverse Cholesky factor of the covariance; being triangular, its leading part is a factor of its own."""
+    by_pose: Float[Tensor, "m 16 6"]
+    """Derivative of the pixel errors by the view's pose."""
+    pose_variance: Float[Tensor, "m 6"]
+    pose_error: Float[Tensor, "m 6"]
+    """The view's own pose error as far as it is known; `by_pose` is taken there."""
+
+
+def fit_signs(
+    views: SignViews,
+    shape: Int[Tensor, " n"],
+    start: SignStart,
+    facing: Float[Tensor, "n 3"],
+    noise_scale: Float[Tensor, " n"],
+    config: SignFitConfig,
+) -> SignFit:
+    """Pose and size of every sign that minimise the Tukey-weighted whitened reprojection error (IV-B).
+
+    `facing` is the horizontal direction against the drive. Unlike the paper, the poses' white noise and drift are part of the
+    model. A view's own pose error is integrated out to first order around its estimate, which takes a second round: around
+    zero instead, views that are off to the side would make the sign seem further away than it is.
+    """
+    away = (views.p_world_camera - start.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
+    distance = signed_distance(views.p_world_camera, away, views.frame, views.part)
+    knots = place_knots(distance, away, views.t_s, views.sign, views.part, config.drift)
+    drift = start.size.new_zeros(len(knots.landmark), 3)
+    pose_error = start.size.new_zeros(len(views), 6)
+    # What the polyline leaves of a random walk between two knots, on average.
+    between = torch.full_like(away, config.drift.sigma_m**2 * config.drift.knot_m / 6)
+    problem, state, whitened = None, None, None
+    for _ in range(config.rounds):
+        drifted = se3.make(
+            views.T_world_camera[:, :3, :3], views.p_world_camera + knots.at_views(drift)
+        )
+        noise = _noise(views, drifted, shape, start, pose_error, noise_scale, between, config)
+        problem, values = _problem(views, shape, start, noise, facing, config)
+        problem = _with_drift(problem, views, shape, knots, config)
+        state = lm.solve(problem, {**values, "drift": drift}, config.lm)
+        start = SignStart(state.values["sign"], state.values["size"])
+        drift = state.values["drift"]
+        whitened = _whitened(problem, state.values, shape, views)
+        pose_error = _pose_error(whitened, noise, shape, views, config)
+    return _read(problem, state, _mean_square(whitened, shape, views))
+
+
+def fit_signs_coarsely(
+    views: SignViews,
+    shape: Int[Tensor, " n"],
+    start: SignStart,
+    facing: Float[Tensor, "n 3"],
+    config: SignFitConfig,
+) -> SignFit:
+    """`fit_signs` with the drift counted as white noise: a cheap problem for starts that are still far off."""
+    ones = torch.ones_like(start.size[:, 0])
+    nothing = start.size.new_zeros(len(views), 6)
+    extra = _distance(views, start).abs() * config.drift.sigma_m**2
+    noise = _noise(views, views.T_world_camera, shape, start, nothing, ones, extra, config)
+    problem, values = _problem(views, shape, start, noise, facing, config)
+    state = lm.solve(problem, values, config.lm)
+    whitened = _whitened(problem, state.values, shape, views)
+    return _read(problem, state, _mean_square(whitened, shape, views))
+
+
+def robust_noise_scale(
+    error_sq: Float[Tensor, " m"], sign: Int[Tensor, " m"], count: int, most: float
+) -> Float[Tensor, " count"]:
+    """By how much the noise of each sign's views exceeds what was assumed: root of the median mean square, 1 to `most`."""
+    order = torch.argsort(error_sq)
+    order = order[torch.argsort(sign[order], stable=True)]
+    number = torch.bincount(sign, minlength=count)
+    middle = number.cumsum(0) - number + number.div(2, rounding_mode="floor")
+    return error_sq[order][middle].sqrt().clamp(1.0, most)
+
+
+def sign_view(
+    T_world_sign: Float[Tensor, "4 4"],
+    size: Float[Tensor, " 2"],
+    T_world_camera: Float[Tensor, "4 4"],
+    template: Float[Tensor, "c 2"],
+    observation: Float[Tensor, "c 3 3"],
+    expected: Float[Tensor, " e"],
+    whitening: Float[Tensor, "e e"],
+) -> Float[Tensor, " e"]:
+    """Whitened pixel errors of all corners of one detection, beyond those expected of the pose's own error (IV-B)."""
+    error = torch.func.vmap(residuals.sign_reprojection, in_dims=(None, None, None, 0, 0))(
+        T_world_camera, T_world_sign, size, template, observation
+    )
+    return whitening @ (error.reshape(-1) - expected)
+
+
+def drifting_sign_view(
+    T_world_sign: Float[Tensor, "4 4"],
+    size: Float[Tensor, " 2"],
+    before: Float[Tensor, " 3"],
+    after: Float[Tensor, " 3"],
+    T_world_camera: Float[Tensor, "4 4"],
+    template: Float[Tensor, "c 2"],
+    observation: Float[Tensor, "c 3 3"],
+    expected: Float[Tensor, " e"],
+    whitening: Float[Tensor, "e e"],
+    share: Float[Tensor, ""],
+) -> Float[Tensor, " e"]:
+    """`sign_view` from a pose whose position is off by the interpolation of two knots."""
+    moved = se3.make(
+        T_world_camera[:3, :3], T_world_camera[:3, 3] + (1 - share) * before + share * after
+    )
+    return sign_view(T_world_sign, size, moved, template, observation, expected, whitening)
+
+
+def sign_view_jacobian(
+    T_world_sign: Float[Tensor, "m 4 4"],
+    size: Float[Tensor, "m 2"],
+    T_world_camera: Float[Tensor, "m 4 4"],
+    template: Float[Tensor, "m c 2"],
+    observation: Float[Tensor, "m c 3 3"],
+    expected: Float[Tensor, "m e"],
+    whitening: Float[Tensor, "m e e"],
+) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor]]:
+    """`sign_view` and its Jacobians by sign pose and relative size."""
+    error, (_, by_sign, by_size) = _corner_errors(
+        T_world_camera, T_world_sign, size, template, observation
+    )
+    whitened = (whitening @ (error - expected)[..., None])[..., 0]
+    return whitened, (whitening @ by_sign, whitening @ by_size)
+
+
+def drifting_sign_view_jacobian(
+    T_world_sign: Float[Tensor, "m 4 4"],
+    size: Float[Tensor, "m 2"],
+    before: Float[Tensor, "m 3"],
+    after: Float[Tensor, "m 3"],
+    T_world_camera: Float[Tensor, "m 4 4"],
+    template: Float[Tensor, "m c 2"],
+    observation: Float[Tensor, "m c 3 3"],
+    expected: Float[Tensor, "m e"],
+    whitening: Float[Tensor, "m e e"],
+    share: Float[Tensor, " m"],
+) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """`drifting_sign_view` and its Jacobians by sign pose, relative size and the two knots."""
+    a = share[:, None]
+    p = T_world_camera[:, :3, 3] + (1 - a) * before + a * after
+    moved = se3.make(T_world_camera[:, :3, :3], p)
+    whitened, (by_sign, by_size) = sign_view_jacobian(
+        T_world_sign, size, moved, template, observation, expected, whitening
+    )
+    # A camera that moves one way sees the sign move the other way.
+    by_drift = -by_sign[..., :3]
+    a = a[..., None]
+    return whitened, (by_sign, by_size, (1 - a) * by_drift, a * by_drift)
+
+
+def sign_habit(
+    T_world_sign: Float[Tensor, "4 4"],
+    size: Float[Tensor, " 2"],
+    facing: Float[Tensor, " 3"],
+    typical_size: Float[Tensor, " 2"],
+) -> Float[Tensor, " 5"]:
+    """How unusual a sign is, as small angles and logarithms: it faces the drive, stands upright and has a usual size."""
+    R = T_world_sign[:3, :3]
+    right = facing @ R[:, 0]
+    log_size = (size / typical_size).log()
+    return torch.stack((right, R[2, 0], R[2, 2], log_size[0], log_size[1]))
+
+
+def _problem(
+    views: SignViews,
+    shape: Int[Tensor, " n"],
+    start: SignStart,
+    noise: _Noise,
+    facing: Float[Tensor, "n 3"],
+    config: SignFitConfig,
+) -> tuple[Problem, dict[str, Tensor]]:
+    """One independent problem per sign: its views, and what is usual."""
+    own = torch.arange(len(shape), device=shape.device)
+    variables = {
+        "sign": Variable(6, se3.retract, group=own),
+        "size": Variable(2, positive, group=own),
+    }
+    moved = se3.retract(views.T_world_camera, noise.pose_error)
+    expected = (noise.by_pose @ noise.pose_error[..., None])[..., 0]
+    templates = polygon.template(shape).to(start.size)
+    terms = {}
+    for name, rows, c in _by_corners(views, shape):
+        at = views.sign[rows]
+        terms[name] = CostTerm(
+            sign_view,
+            (("sign", at), ("size", at)),
+            (
+                *(moved[rows], templates[at, :c], views.observation[rows, :c]),
+                *(expected[rows, : 2 * c], noise.whitening[rows, : 2 * c, : 2 * c]),
+            ),
+            loss=Tukey(config.tukey * (2 * c) ** 0.5),
+            jacobian=sign_view_jacobian,
+        )
+    angles = (config.sigma_facing_rad, config.sigma_upright_rad, config.sigma_upright_rad)
+    sigma = facing.new_tensor((*angles, config.sigma_log_size, config.sigma_log_size))
+    terms["habit"] = CostTerm(
+        sign_habit,
+        (("sign", own), ("size", own)),
+        (facing, torch.full_like(start.size, config.typical_size_m)),
+        weight=(1 / sigma).expand(len(own), 5),
+    )
+    values = {"sign": start.T_world_sign, "size": start.size}
+    return Problem(variables, terms, group_count=len(own)), values
+
+
+def _with_drift(
+    problem: Problem, views: SignViews, shape: Tensor, knots: DriftKnots, config: SignFitConfig
+) -> Problem:
+    """The same problem with the drift between views as further unknowns."""
+    terms = dict(problem.terms)
+    for name, rows, _ in _by_corners(views, shape):
+        still = terms[name]
+        before = knots.before[rows]
+        terms[name] = CostTerm(
+            drifting_sign_view,
+            (*still.slots, ("drift", before), ("drift", before + 1)),
+            (*still.constants, knots.share[rows]),
+            loss=still.loss,
+            jacobian=drifting_sign_view_jacobian,
+        )
+    drift = Variable(3, euclidean, group=knots.landmark)
+    return Problem(
+        {**problem.variables, "drift": drift},
+        {**terms, **drift_terms(knots, config.drift)},
+        problem.group_count,
+    )
+
+
+def _by_corners(views: SignViews, shape: Int[Tensor, " n"]) -> list[tuple[str, Tensor, int]]:
+    """Name of the term, rows of the views and number of corners, for each number of corners that occurs."""
+    count = polygon.corner_count(shape)[views.sign]
+    return [
+        (f"corners_{c}", (count == c).nonzero()[:, 0], c) for c in count.unique().tolist()
+    ]
+
+
+def _noise(
+    views: SignViews,
+    T_world_camera: Float[Tensor, "m 4 4"],
+    shape: Int[Tensor, " n"],
+    start: SignStart,
+    pose_error: Float[Tensor, "m 6"],
+    noise_scale: Float[Tensor, " n"],
+    extra_variance: Float[Tensor, " m"],
+    config: SignFitConfig,
+) -> _Noise:
+    """Covariances of the views of signs at `start`, seen from drifted poses with their own errors on top."""
+    at = views.sign
+    template = polygon.template(shape).to(start.size)[at]
+    _, (by_pose, _, _) = _corner_errors(
+        se3.retract(T_world_camera, pose_error),
+        start.T_world_sign[at],
+        start.size[at],
+        template,
+        views.observation,
+    )
+    distance = _distance(views, start).abs()
+    position = config.pose_sigma_m**2 + extra_variance
+    rotation = config.pose_sigma_rad**2 + config.drift.sigma_rad**2 * distance
+    variance = torch.stack((position, rotation), dim=-1).repeat_interleave(3, dim=-1)
+    box = (views.corners_px.amax(1) - views.corners_px.amin(1)).amax(-1)
+    pixel = config.sigma_px**2 * (1 + (config.small_box_px / box).square())
+    covariance = (by_pose * variance[:, None]) @ by_pose.mT
+    covariance.diagonal(dim1=-2, dim2=-1).add_((pixel * noise_scale[at].square())[:, None])
+    factor = torch.linalg.cholesky(covariance)
+    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    whitening = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+    return _Noise(whitening, by_pose, variance, pose_error)
+
+
+def _corner_errors(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    T_world_sign: Float[Tensor, "m 4 4"],
+    size: Float[Tensor, "m 2"],
+    template: Float[Tensor, "m c 2"],
+    observation: Float[Tensor, "m c 3 3"],
+) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor, Tensor]]:
+    """Pixel errors of all corners of every detection, and their Jacobians by camera, sign and size."""
+    m, c = template.shape[:2]
+
+    def for_corners(x: Tensor) -> Tensor:
+        return x[:, None].expand(m, c, *x.shape[1:]).flatten(0, 1)
+
+    error, (by_pose, by_sign, by_size) = residuals.sign_reprojection_jacobian(
+        for_corners(T_world_camera),
+        for_corners(T_world_sign),
+        for_corners(size),
+        template.flatten(0, 1),
+        observation.flatten(0, 1),
+    )
+    jacobians = tuple(J.reshape(m, 2 * c, -1) for J in (by_pose, by_sign, by_size))
+    return error.reshape(m, 2 * c), jacobians
+
+
+def _distance(views: SignViews, start: SignStart) -> Float[Tensor, " m"]:
+    away = (views.p_world_camera - start.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
+    return signed_distance(views.p_world_camera, away, views.frame, views.part)
+
+
+def _pose_error(
+    whitened: Float[Tensor, "m 16"],
+    noise: _Noise,
+    shape: Int[Tensor, " n"],
+    views: SignViews,
+    config: SignFitConfig,
+) -> Float[Tensor, "m 6"]:
+    """The most likely error of each view's pose, given what is left of its pixel errors; zero for views without a say."""
+    by_pose = noise.whitening @ noise.by_pose
+    posterior = noise.pose_variance * (by_pose.mT @ whitened[..., None])[..., 0]
+    has_say = _mean_square(whitened, shape, views) < config.tukey**2
+    # The error is predicted minus observed: a camera that is off by d makes it by_pose d larger, and is corrected by -d.
+    return torch.where(has_say[:, None], -posterior, torch.zeros_like(posterior))
+
+
+def _mean_square(
+    whitened: Float[Tensor, "m 16"], shape: Int[Tensor, " n"], views: SignViews
+) -> Float[Tensor, " m"]:
+    return whitened.square().sum(-1) / (2 * polygon.corner_count(shape)[views.sign])
+
+
+def _whitened(
+    problem: Problem, values: Mapping[str, Tensor], shape: Int[Tensor, " n"], views: SignViews
+) -> Float[Tensor, "m 16"]:
+    """Whitened errors of every view; zero past its shape's corners."""
+    result = values["size"].new_zeros(len(views), 2 * polygon.MAX_CORNERS)
+    for name, rows, c in _by_corners(views, shape):
+        result[rows, : 2 * c] = rows_of_term(problem.terms[name], values)
+    return result
+
+
+def _read(
+    problem: Problem, state: lm.LmState, error_sq: Float[Tensor, " m"]
+) -> SignFit:
+    normal = DenseBackend().assemble(problem, state.values)
+    covariance = normal.covariance()
+    first = normal.where.offset["sign"]
+    centre = first[:, None] + torch.arange(3, device=first.device)
+    own = torch.arange(len(first), device=first.device)[:, None, None]
+    return SignFit(
+        T_world_sign=state.values["sign"],
+        size=state.values["size"],
+        cost=state.cost,
+        covariance=covariance[own, centre[:, :, None], centre[:, None, :]],
+        error_sq=error_sq,
+    )

@@ -1,0 +1,1 @@
+"""The stages of the mapping pipeline, one module each."""

@@ -1,0 +1,319 @@
+"""V-B: bundle adjustment of camera poses, signs and lanes of all journeys (eq:ba).
+
+`build` makes a `Bundle` from journeys, a first map and the associations. The loop over it reads like training: `refresh`, a
+step of the solver, `fold`; `adjust` is that loop for those who need no logging. `read_signs`, `read_lanes` and `read_poses` give
+the result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch import residuals
+from crowdmap_torch.bundle import AdjustConfig, Bundle, DriftNodes, PosePriorConfig
+from crowdmap_torch.geometry import plane, se3, spline_basis
+from crowdmap_torch.lane_matching import LaneMatches, nearest_lanes
+from crowdmap_torch.observations import (
+    LanePointObservations,
+    corner_observations,
+    frame_offsets,
+    lane_point_observations,
+    spaced_frames,
+    station,
+)
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.problem import CostTerm, Variable, euclidean, positive
+from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Signs
+
+
+def build(
+    journeys: Sequence[Journey],
+    roads: Sequence[RoadEstimate],
+    signs: Signs,
+    lanes: Lanes,
+    associations: Sequence[Association],
+    drifts: Sequence[Float[Tensor, "f 6"]],
+    config: AdjustConfig,
+) -> Bundle:
+    """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
+
+    `drifts` are tangents per frame, from the positioning module's pose to the start pose.
+    """
+    offsets = frame_offsets(journeys)
+    prior = torch.cat([journey.T_world_camera for journey in journeys])
+    drift = torch.cat(list(drifts))
+    start = se3.retract(prior, drift)
+    corners = corner_observations(journeys, associations, signs)
+    points, matches = _lane_rows(journeys, roads, lanes, start, config)
+
+    used = torch.zeros(len(prior), dtype=torch.bool, device=prior.device)
+    used[corners.frame] = True
+    used[points.frame] = True
+    kept = torch.cat(
+        [
+            spaced_frames(journey, used[a:b], config.frame_spacing_m)
+            for journey, a, b in zip(journeys, offsets, offsets[1:], strict=False)
+        ]
+    )
+    row_of_frame = torch.where(kept, kept.cumsum(0) - 1, -1)
+    frame = torch.nonzero(kept)[:, 0]
+    corners = corners[kept[corners.frame]]
+    corners = replace(corners, frame=row_of_frame[corners.frame])
+    of_kept = kept[points.frame]
+    points, matches = points[of_kept], matches[of_kept]
+    points = replace(points, frame=row_of_frame[points.frame])
+
+    journey = torch.searchsorted(torch.tensor(offsets[1:], device=frame.device), frame, right=True)
+    way = torch.cat([station(journey.T_world_camera) for journey in journeys])[frame]
+    nodes = _drift_nodes(journey, way, config.drift_spacing_m)
+    values = {
+        "pose": start[frame],
+        "drift": drift[frame][nodes.first],
+        "sign": signs.T_world_sign,
+        "size": signs.size,
+        "lane": spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count),
+    }
+    variables = {
+        "pose": Variable(6, se3.retract),
+        "drift": Variable(6, euclidean),
+        "sign": Variable(6, se3.retract),
+        "size": Variable(2, positive),
+        "lane": Variable(3, euclidean),
+    }
+    fixed = _pose_terms(journeys, prior[frame], nodes, config)
+    fixed.update(_lane_prior(values["lane"], lanes, config))
+    return Bundle(
+        values, variables, fixed, corners, points, matches, lanes.control_count, frame, nodes, config
+    )
+
+
+def adjust(bundle: Bundle) -> lm.LmState:
+    """The state at the end of the adjustment; the bundle holds its values."""
+    backend = bundle.backend()
+    state = start(bundle)
+    for _ in range(bundle.config.lm.max_iterations):
+        state, finished = adjust_step(bundle, state, backend)
+        if finished:
+            break
+    return state
+
+
+@torch.no_grad()
+def start(bundle: Bundle) -> lm.LmState:
+    """The state before the first step: lanes matched, scales as wide as the residuals show."""
+    bundle.refresh()
+    return lm.init(bundle.problem(), bundle.values(), bundle.config.lm)
+
+
+@torch.no_grad()
+def adjust_step(bundle: Bundle, state: lm.LmState, backend) -> tuple[lm.LmState, bool]:
+    """One step of the solver, folded into the bundle, and whether the adjustment is finished.
+
+    Lanes are matched anew and the scales narrowed after every step that was taken; it is finished when the solver stops
+    while the scales are at rest.
+    """
+    state = lm.step(bundle.problem(), state, bundle.config.lm, backend=backend)
+    if not bool(state.accepted.all()):
+        return state, state.done
+    bundle.fold(dict(state.values))
+    at_rest = bundle.refresh()
+    if state.done and at_rest:
+        return state, True
+    return lm.changed(state), False
+
+
+def _lane_rows(
+    journeys: Sequence[Journey],
+    roads: Sequence[RoadEstimate],
+    lanes: Lanes,
+    T_world_camera: Float[Tensor, "f 4 4"],
+    config: AdjustConfig,
+) -> tuple[LanePointObservations, LaneMatches]:
+    """Lane points that lie near a lane of the map, and the lane and parameter each starts at."""
+    points = lane_point_observations(
+        journeys,
+        roads,
+        keyframe_spacing=config.keyframe_spacing_m,
+        points_per_detection=config.points_per_detection,
+        height_sigma=config.lane_height_sigma_m,
+    )
+    ray = torch.nn.functional.pad(points.ideal, (0, 1), value=1.0)
+    h = points.normal_camera * points.camera_height[:, None]
+    distance = h.square().sum(-1) / (h * ray).sum(-1)
+    near = (distance > 0) & (distance < config.max_ground_distance_m)
+    points, ray, h = points[near], ray[near], h[near]
+    ground = plane.ground_points(ray, h, T_world_camera[points.frame])
+    lane, t = nearest_lanes(ground, lanes, gate=config.lane_gate_m)
+    found = lane >= 0
+    matches = LaneMatches(lane[found], t[found], points.ideal[found], found[found])
+    return points[found], matches
+
+
+def _drift_nodes(
+    journey: Int[Tensor, " n"], way: Float[Tensor, " n"], spacing: float
+) -> DriftNodes:
+    """Stretches of at most `spacing` metres in which the drift is taken to stand still."""
+    cell = (way / spacing).floor()
+    begins = torch.ones_like(journey, dtype=torch.bool)
+    begins[1:] = (journey[1:] != journey[:-1]) | (cell[1:] != cell[:-1])
+    of_frame = begins.cumsum(0) - 1
+    first = torch.nonzero(begins)[:, 0]
+    count = torch.bincount(of_frame, minlength=len(first))
+    centre = way.new_zeros(len(first)).index_add_(0, of_frame, way) / count
+    return DriftNodes(of_frame, first, journey[first], centre)
+
+
+def _pose_terms(
+    journeys: Sequence[Journey],
+    prior: Float[Tensor, "n 4 4"],
+    nodes: DriftNodes,
+    config: AdjustConfig,
+) -> dict[str, CostTerm]:
+    """Absolute and relative regularisation of the poses (V-B, footnote).
+
+    A frame's error is a slow drift and white noise. The drift's stationary variance is that of bias and drift together,
+    and it loses memory at the rate that keeps the drift's short-range changes: one chain stands for both.
+    """
+    sigma, length = _drift_model(journeys, prior, config.prior)
+    white = prior.new_tensor(
+        [config.prior.white_sigma_m] * 3 + [math.radians(config.prior.white_sigma_deg)] * 3
+    )
+    # Within a stretch the drift does move: by a random walk of a quarter of its length in the mean.
+    rate = 2 * sigma.square() / length
+    white = (white.square() + rate * config.drift_spacing_m / 4).sqrt()
+    deviation = CostTerm(
+        residuals.pose_deviation,
+        (("pose", torch.arange(len(prior), device=prior.device)), ("drift", nodes.of_frame)),
+        (prior,),
+        1 / white[nodes.journey[nodes.of_frame]],
+        jacobian=residuals.pose_deviation_jacobian,
+    )
+    follows = torch.nonzero(nodes.journey[1:] == nodes.journey[:-1])[:, 0]
+    gap = (nodes.way[follows + 1] - nodes.way[follows]).clamp_min(0.1)[:, None]
+    total, reach = sigma[nodes.journey[follows]], length[nodes.journey[follows]]
+    transition = CostTerm(
+        residuals.drift_transition,
+        (("drift", follows), ("drift", follows + 1)),
+        (torch.exp(-gap / reach),),
+        1 / (total * (-torch.expm1(-2 * gap / reach)).sqrt()),
+        jacobian=residuals.drift_transition_jacobian,
+    )
+    begins = torch.ones_like(nodes.journey, dtype=torch.bool)
+    begins[1:] = nodes.journey[1:] != nodes.journey[:-1]
+    first = torch.nonzero(begins)[:, 0]
+    start = CostTerm(
+        residuals.drift_start, (("drift", first),), (), 1 / sigma[nodes.journey[first]]
+    )
+    return {"pose_absolute": start, "pose_relative": transition, "pose_white": deviation}
+
+
+def _drift_model(
+    journeys: Sequence[Journey], prior: Tensor, config: PosePriorConfig
+) -> tuple[Float[Tensor, "j 6"], Float[Tensor, "j 6"]]:
+    """Stationary sigma and correlation length of each journey's drift chain, position then rotation."""
+    drift = prior.new_tensor([config.drift_sigma_m] * 3)
+    angle = math.radians(config.rotation_sigma_deg)
+    sigmas, lengths = [], []
+    for journey in journeys:
+        total = (drift.square() + prior.new_tensor(config.bias_sigma_m).square()).sqrt()
+        if journey.sigma_position is not None:
+            total = torch.maximum(journey.sigma_position.to(prior).median(0).values, drift)
+        turn = prior.new_tensor(angle)
+        if journey.sigma_rotation is not None:
+            turn = journey.sigma_rotation.to(prior).median().clamp_min(angle / 10)
+        sigmas.append(torch.cat((total, turn.expand(3))))
+        # Same change over a short way: sigma^2 / length is that of the drift alone.
+        length = config.drift_length_m * (total / drift).square()
+        lengths.append(torch.cat((length, prior.new_tensor([config.rotation_length_m] * 3))))
+    return torch.stack(sigmas), torch.stack(lengths)
+
+
+def _lane_prior(
+    coefficient: Float[Tensor, "c 3"], lanes: Lanes, config: AdjustConfig
+) -> dict[str, CostTerm]:
+    """The weak prior that holds control points along the marker, and where it is hardly seen."""
+    if not len(lanes):
+        return {}
+    spline, rank = spline_basis.rows(lanes.control_count)
+    along = spline_basis.derivative_flat(
+        lanes.control.point_world, lanes.control_count, rank.to(coefficient), spline
+    )
+    up = torch.zeros_like(along)
+    up[:, 2] = 1
+    forward = torch.nn.functional.normalize(along, dim=-1)
+    left = torch.nn.functional.normalize(torch.linalg.cross(up, forward), dim=-1)
+    axes = torch.stack((forward, left, torch.linalg.cross(forward, left)), dim=-1)
+    shift = config.lane_shift_sigma_m
+    weight = 1 / coefficient.new_tensor([config.lane_slide_sigma_m, shift, shift])
+    term = CostTerm(
+        residuals.lane_prior,
+        (("lane", torch.arange(len(coefficient), device=coefficient.device)),),
+        (coefficient.clone(), axes),
+        weight.expand(len(coefficient), 3).contiguous(),
+        jacobian=residuals.lane_prior_jacobian,
+    )
+    return {"lane_prior": term}
+
+
+@torch.no_grad()
+def read_poses(bundle: Bundle, journeys: Sequence[Journey]) -> tuple[Float[Tensor, "f 4 4"], ...]:
+    """Refined camera poses of every frame; frames without observations take the drift of those around them."""
+    values = bundle.values()
+    offsets = frame_offsets(journeys)
+    poses = []
+    nodes = bundle.nodes
+    for number, (journey, a, b) in enumerate(zip(journeys, offsets, offsets[1:], strict=False)):
+        mine = torch.nonzero((bundle.frame >= a) & (bundle.frame < b))[:, 0]
+        if not len(mine):
+            poses.append(journey.T_world_camera)
+            continue
+        of_journey = torch.nonzero(nodes.journey == number)[:, 0]
+        known, drift = nodes.way[of_journey], values["drift"][of_journey]
+        way = station(journey.T_world_camera)
+        after = torch.searchsorted(known, way).clamp(1, max(len(known) - 1, 1))
+        after = after.clamp_max(len(known) - 1)
+        before = (after - 1).clamp_min(0)
+        span = (known[after] - known[before]).clamp_min(1e-9)
+        share = ((way - known[before]) / span).clamp(0, 1)[:, None]
+        between = drift[before] + share * (drift[after] - drift[before])
+        refined = se3.retract(journey.T_world_camera, between)
+        refined[bundle.frame[mine] - a] = values["pose"][mine]
+        poses.append(refined)
+    return tuple(poses)
+
+
+@torch.no_grad()
+def read_map(
+    bundle: Bundle, signs: Signs, lanes: Lanes, *, covariance: bool = True
+) -> tuple[Signs, Lanes, Float[Tensor, "3 3"]]:
+    """Adjusted signs and lanes with their absolute covariances, and the part that the whole map shares."""
+    values = bundle.values()
+    control = spline_basis.from_coefficients_flat(values["lane"], lanes.control_count)
+    signs = replace(signs, T_world_sign=values["sign"], size=values["size"])
+    lanes = replace(lanes, control=replace(lanes.control, point_world=control))
+    shared = torch.zeros(3, 3, dtype=control.dtype, device=control.device)
+    if not covariance:
+        return signs, lanes, shared
+    normal = bundle.backend().assemble(bundle.problem(), values)
+    joint = normal.marginal_covariance()
+    offset = normal.structure.where.offset
+    xyz = torch.arange(3, device=control.device)
+    at = offset["sign"][:, None] + xyz
+    if len(signs):
+        signs = replace(signs, covariance=joint[at[:, :, None], at[:, None, :]])
+        shared = joint[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
+    at = offset["lane"][:, None] + xyz
+    if len(lanes):
+        blocks = joint[at[:, :, None], at[:, None, :]]
+        axes = bundle.fixed["lane_prior"].constants[1]
+        across = (axes[:, :, 1][:, None] @ blocks @ axes[:, :, 1][..., None])[:, 0, 0]
+        lanes = replace(lanes, control=replace(lanes.control, sigma=across.clamp_min(0).sqrt()))
+        if not len(signs):
+            shared = joint[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
+    return signs, lanes, (shared + shared.mT) / 2

@@ -1,0 +1,451 @@
+"""IV-B: sign tracklets of one journey -> signs in the world, and why the other tracklets were pruned."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import group_mode, group_sum
+from crowdmap_torch.clustering.neighbours import near_pairs
+from crowdmap_torch.geometry import camera, polygon, se3
+from crowdmap_torch.pose_drift import closest_view
+from crowdmap_torch.sign_fit import (
+    SignFit,
+    SignFitConfig,
+    SignStart,
+    SignViews,
+    fit_signs,
+    fit_signs_coarsely,
+    robust_noise_scale,
+)
+from crowdmap_torch.sign_start import against_the_drive, centre_points, starts
+from crowdmap_torch.tables import Journey, Signs, Tracklets, concatenate
+
+REASONS = (
+    "kept",
+    "too few frames",
+    "too little parallax",
+    "too far away",
+    "behind the camera",
+    "residual too large",
+    "position too uncertain",
+    "implausible size",
+    "rejoined with another tracklet",
+)
+"""What becomes of a tracklet, by code."""
+KEPT, FEW_FRAMES, NO_PARALLAX, TOO_FAR, BEHIND, RESIDUAL, UNCERTAIN, SIZE, REJOINED = range(9)
+
+
+@dataclass(frozen=True)
+class RejoinConfig:
+    """When two tracklets that no frame has both of are one sign."""
+
+    max_distance: float = 4.0
+    """Centres further apart, in standard deviations of both and of the drift between them, are two signs."""
+    max_distance_m: float = 2.5
+    """As are those further apart than this."""
+    max_size_ratio: float = 1.5
+    """As are signs whose width or height differ by more, beyond what the frames leave open."""
+    min_facing: float = 0.5
+    """As are signs whose normals have a smaller scalar product."""
+    drift_m: float = 0.029
+    """Drift of positions over one metre of travel; it grows with the square root of the way."""
+    drift_limit_m: float = 0.35
+    """Drift of positions over any way."""
+    speed: float = 12.0
+    """Turns the time between two tracklets into a way [m/s]."""
+    pass_gap_s: float = 5.0
+    """Views of a sign after a longer silence are another pass, with a drift of its own."""
+
+
+@dataclass(frozen=True)
+class SignTriangulationConfig:
+    """How tracklets become signs, and which do not (IV-B)."""
+
+    min_frames: int = 3
+    """Tracklets with fewer detections of the tracklet's shape are pruned."""
+    min_parallax_deg: float = 0.7
+    """Tracklets whose rays differ by less are pruned."""
+    max_distance_m: float = 80.0
+    """Tracklets whose closest view is further away are pruned."""
+    max_noise_scale: float = 3.9
+    """Tracklets whose views are noisier, as a multiple of the noise expected, are pruned."""
+    min_inlier_share: float = 0.5
+    """Tracklets of whose views fewer agree with the sign are pruned."""
+    max_sigma_m: float = 1.5
+    """Tracklets whose centre has a larger standard deviation in any direction are pruned."""
+    size_m: tuple[float, float] = (0.1, 8.0)
+    """Smallest and largest plausible width and height."""
+    confident_frames: float = 4.0
+    """Views in agreement, weighted by their scores, at which the confidence reaches 1 - 1/e."""
+    start_yaw_deg: tuple[float, ...] = (-30.0, 30.0)
+    """Angles from the line of sight to start from, beside the best plane."""
+    rejoin: RejoinConfig = field(default_factory=RejoinConfig)
+    """When tracklets are put together again after a gap."""
+    fit: SignFitConfig = field(default_factory=SignFitConfig)
+    """The minimisation."""
+
+
+@dataclass(frozen=True)
+class SignReport:
+    """What became of the tracklets of one journey."""
+
+    reason: Int[Tensor, " count"]
+    """Index into `REASONS` of every tracklet."""
+    tracklets: Tracklets
+    """As given, but rejoined tracklets share the label of one of them, and the shifts are those to the signs' corners."""
+    error_sq: Float[Tensor, " d"]
+    """Mean square whitened error of every detection that was used; NaN for the others."""
+
+    @property
+    def pruned(self) -> dict[str, int]:
+        """How many tracklets met each fate, those kept included."""
+        counts = torch.bincount(self.reason, minlength=len(REASONS)).tolist()
+        return dict(zip(REASONS, counts, strict=True))
+
+
+@torch.no_grad()
+def triangulate_signs(
+    journey: Journey, tracklets: Tracklets, config: SignTriangulationConfig
+) -> tuple[Signs, SignReport]:
+    """The signs that a journey's tracklets show (the paper's O1), and what was pruned.
+
+    Unlike the paper, the minimisation knows the poses' noise and drift (`sign_fit`), starts from several planes, and
+    tracklets of one sign are put together again where geometry agrees.
+    """
+    shape = _shape_by_vote(journey, tracklets)
+    rows = _usable_rows(journey, tracklets, shape)
+    frames = torch.bincount(tracklets.label[rows], minlength=tracklets.count)
+    reason = torch.where(frames < config.min_frames, FEW_FRAMES, KEPT)
+    rows = rows[reason[tracklets.label[rows]] == KEPT]
+    if not len(rows):
+        return _no_signs(journey), SignReport(reason, tracklets, _per_detection(journey))
+    label, sign = tracklets.label[rows].unique(return_inverse=True)
+    views = _views(journey, tracklets, rows, sign, config)
+    fit, scale = _fit(views, shape[label], config)
+
+    group = _rejoin(views, fit, shape[label], config)
+    joined = group != torch.arange(len(label), device=group.device)
+    if bool(joined.any()):
+        reason[label[joined]] = REJOINED
+        tracklets = replace(tracklets, label=_relabelled(tracklets, label, group))
+        label, new_row = label[~joined], (~joined).cumsum(0) - 1
+        views = _parted(replace(views, sign=new_row[group][views.sign]), config)
+        again = torch.isin(views.sign, new_row[group[joined]])
+        fit, scale = _refit(views, again, shape[label], fit, scale, ~joined, config)
+
+    fate = _fates(views, fit, scale, config)
+    reason[label] = fate
+    kept = fate == KEPT
+    signs, turn = _signs(journey, rows, views, fit, shape[label], label, config)
+    error_sq = _per_detection(journey).index_put((rows,), fit.error_sq)
+    tracklets = _turned(journey, tracklets, shape, label, turn)
+    return signs[kept], SignReport(reason, tracklets, error_sq)
+
+
+def _shape_by_vote(journey: Journey, tracklets: Tracklets) -> Int[Tensor, " count"]:
+    """The shape that most detections of each tracklet have."""
+    ones = torch.ones_like(journey.signs.score)
+    return group_mode(journey.signs.shape, ones, tracklets.label, tracklets.count)
+
+
+def _usable_rows(
+    journey: Journey, tracklets: Tracklets, shape: Int[Tensor, " count"]
+) -> Int[Tensor, " m"]:
+    """Rows of the detections that have a tracklet and its shape."""
+    if not tracklets.count:
+        return tracklets.label[:0]
+    label = tracklets.label
+    good = (label >= 0) & (journey.signs.shape == shape[label.clamp_min(0)])
+    return good.nonzero()[:, 0]
+
+
+def _views(
+    journey: Journey,
+    tracklets: Tracklets,
+    rows: Int[Tensor, " m"],
+    sign: Int[Tensor, " m"],
+    config: SignTriangulationConfig,
+) -> SignViews:
+    detections = journey.signs[rows]
+    count = polygon.corner_count(detections.shape)
+    assert tracklets.shift is not None, "sign tracklets come with corner shifts"
+    shift = tracklets.shift[rows]
+    px = polygon.roll(detections.corners_px, shift, count)
+    ideal = polygon.roll(detections.corners_ideal, shift, count)
+    since_start = journey.t_ns - journey.t_ns[:1]
+    views = SignViews(
+        sign=sign,
+        part=sign,
+        frame=detections.frame,
+        t_s=since_start[detections.frame].to(px) * 1e-9,
+        corners_px=px,
+        corners_ideal=ideal,
+        observation=camera.observation_matrix(journey.rig.camera, px, ideal),
+        T_world_camera=journey.T_world_camera[detections.frame],
+    )
+    return _parted(views, config)
+
+
+def _parted(views: SignViews, config: SignTriangulationConfig) -> SignViews:
+    """The views with every sign's passes told apart by long silences."""
+    order = torch.argsort(views.frame, stable=True)
+    order = order[torch.argsort(views.sign[order], stable=True)]
+    sign, t = views.sign[order], views.t_s[order]
+    begins = torch.zeros_like(sign, dtype=torch.bool)
+    begins[1:] = (sign[1:] != sign[:-1]) | (t[1:] - t[:-1] > config.rejoin.pass_gap_s)
+    part = torch.empty_like(views.part)
+    part[order] = begins.long().cumsum(0)
+    return replace(views, part=part)
+
+
+def _fit(
+    views: SignViews, shape: Int[Tensor, " n"], config: SignTriangulationConfig
+) -> tuple[SignFit, Float[Tensor, " n"]]:
+    """Signs fitted from several starts without the drift, then from the best one with it; and their noise scales."""
+    n, m = len(shape), len(views)
+    centre = centre_points(views, n, typical_height_m=config.fit.typical_size_m)
+    facing = against_the_drive(views, n)
+    yaws = tuple(math.radians(yaw) for yaw in config.start_yaw_deg)
+    begin = starts(views, shape, centre, yaws=yaws, size_limits=config.size_m)
+    k = len(begin)
+    parts = int(views.part.max()) + 1
+    coarse = fit_signs_coarsely(
+        concatenate(
+            [
+                replace(views, sign=views.sign + i * n, part=views.part + i * parts)
+                for i in range(k)
+            ]
+        ),
+        shape.repeat(k),
+        SignStart(torch.cat([s.T_world_sign for s in begin]), torch.cat([s.size for s in begin])),
+        facing.repeat(k, 1),
+        config.fit,
+    )
+    cost = torch.where(coarse.cost.isfinite(), coarse.cost, torch.inf).reshape(k, n)
+    choice = cost.argmin(0)
+    best = choice * n + torch.arange(n, device=shape.device)
+    view = choice[views.sign] * m + torch.arange(m, device=shape.device)
+    most = config.fit.max_noise_scale
+    scale = robust_noise_scale(coarse.error_sq[view], views.sign, n, most)
+    start = SignStart(coarse.T_world_sign[best], coarse.size[best])
+    return fit_signs(views, shape, start, facing, scale, config.fit), scale
+
+
+def _refit(
+    views: SignViews,
+    again: Bool[Tensor, " m"],
+    shape: Int[Tensor, " n"],
+    fit: SignFit,
+    scale: Float[Tensor, " before"],
+    kept: Bool[Tensor, " before"],
+    config: SignTriangulationConfig,
+) -> tuple[SignFit, Float[Tensor, " n"]]:
+    """The fit of the signs `kept`, those of the views `again` anew."""
+    sign, compact = views.sign[again].unique(return_inverse=True)
+    some = _parted(replace(views[again], sign=compact), config)
+    new, new_scale = _fit(some, shape[sign], config)
+
+    def merged(old: Tensor, part: Tensor) -> Tensor:
+        return old[kept].index_put((sign,), part)
+
+    result = SignFit(
+        T_world_sign=merged(fit.T_world_sign, new.T_world_sign),
+        size=merged(fit.size, new.size),
+        cost=merged(fit.cost, new.cost),
+        covariance=merged(fit.covariance, new.covariance),
+        error_sq=fit.error_sq.index_put((again.nonzero()[:, 0],), new.error_sq),
+    )
+    return result, merged(scale, new_scale)
+
+
+def _rejoin(
+    views: SignViews, fit: SignFit, shape: Int[Tensor, " n"], config: SignTriangulationConfig
+) -> Int[Tensor, " n"]:
+    """For each tracklet the first of those that show the same sign: itself, unless geometry says otherwise."""
+    rules = config.rejoin
+    n = len(shape)
+    centre = fit.T_world_sign[:, :3, 3]
+    pairs = near_pairs(centre, radius=rules.max_distance_m, count=8)
+    a, b = pairs.unbind(-1)
+    begin = torch.full_like(fit.cost, torch.inf).scatter_reduce(0, views.sign, views.t_s, "amin")
+    end = torch.full_like(fit.cost, -torch.inf).scatter_reduce(0, views.sign, views.t_s, "amax")
+    gap_s = torch.maximum(begin[a] - end[b], begin[b] - end[a]).clamp_min(0)
+    drift = (rules.drift_m * (gap_s * rules.speed + 1).sqrt()).clamp_max(rules.drift_limit_m)
+    eye = torch.eye(3, dtype=drift.dtype, device=drift.device)
+    covariance = fit.covariance[a] + fit.covariance[b] + drift.square()[:, None, None] * eye
+    offset = (centre[a] - centre[b])[..., None]
+    distance_sq = (offset.mT @ torch.linalg.solve(covariance, offset))[:, 0, 0]
+    facing = (fit.T_world_sign[a, :3, 2] * fit.T_world_sign[b, :3, 2]).sum(-1)
+    # A size is known no better than the depth along with which it was estimated.
+    depth_sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    slack = 1 + depth_sigma / _closest_distance(views, fit)[a]
+    ratio = torch.maximum(fit.size[a] / fit.size[b], fit.size[b] / fit.size[a]).amax(-1)
+    agrees = (
+        (distance_sq < rules.max_distance**2)
+        & (shape[a] == shape[b])
+        & (facing > rules.min_facing)
+        & (ratio < rules.max_size_ratio * slack)
+    )
+    candidates = pairs[agrees][torch.argsort(distance_sq[agrees], stable=True)]
+    return _without_common_frames(views, candidates, n)
+
+
+def _without_common_frames(
+    views: SignViews, pairs: Int[Tensor, "p 2"], n: int
+) -> Int[Tensor, " n"]:
+    """Groups made by joining pairs in order, unless a frame shows both: two things seen at once are two things."""
+    group = list(range(n))
+    concerned = set(pairs.flatten().tolist())
+    frames = {
+        sign: set(views.frame[views.sign == sign].tolist()) for sign in sorted(concerned)
+    }
+    for a, b in pairs.tolist():
+        first, second = sorted((group[a], group[b]))
+        if first == second or frames[first] & frames[second]:
+            continue
+        frames[first] |= frames.pop(second)
+        group = [first if g == second else g for g in group]
+    return torch.tensor(group, dtype=torch.int64, device=views.sign.device)
+
+
+def _relabelled(
+    tracklets: Tracklets, label: Int[Tensor, " n"], group: Int[Tensor, " n"]
+) -> Int[Tensor, " d"]:
+    new = torch.arange(tracklets.count, device=label.device)
+    new[label] = label[group]
+    return torch.where(tracklets.label >= 0, new[tracklets.label], -1)
+
+
+def _closest_distance(views: SignViews, fit: SignFit) -> Float[Tensor, " n"]:
+    away = (views.p_world_camera - fit.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
+    return away[closest_view(away, views.sign)]
+
+
+def _fates(
+    views: SignViews,
+    fit: SignFit,
+    scale: Float[Tensor, " n"],
+    config: SignTriangulationConfig,
+) -> Int[Tensor, " n"]:
+    """Whether each sign is kept, or why it is pruned; the first reason counts."""
+    n = len(scale)
+    in_camera = se3.transform(
+        se3.inverse(views.T_world_camera), fit.T_world_sign[views.sign, :3, 3]
+    )
+    is_behind = (in_camera[:, 2] <= 0).to(scale)
+    agrees = (fit.error_sq < config.fit.tukey**2).to(scale)
+    number = group_sum(torch.ones_like(agrees), views.sign, n)
+    sigma = torch.linalg.eigvalsh(fit.covariance)[:, -1].clamp_min(0).sqrt()
+    low, high = config.size_m
+    tests = (
+        (BEHIND, group_sum(is_behind, views.sign, n) > 0),
+        (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(config.min_parallax_deg)),
+        (TOO_FAR, _closest_distance(views, fit) > config.max_distance_m),
+        (SIZE, ((fit.size < low) | (fit.size > high)).any(-1)),
+        (FEW_FRAMES, group_sum(agrees, views.sign, n) < config.min_frames),
+        (RESIDUAL, group_sum(agrees, views.sign, n) < config.min_inlier_share * number),
+        (RESIDUAL, scale > config.max_noise_scale),
+        (UNCERTAIN, ~(sigma < config.max_sigma_m)),
+    )
+    fate = torch.full_like(views.sign[:1].expand(n), KEPT).clone()
+    for code, fails in tests:
+        fate = torch.where((fate == KEPT) & fails, code, fate)
+    return fate
+
+
+def _parallax(
+    views: SignViews, fit: SignFit, counts: Bool[Tensor, " m"]
+) -> Float[Tensor, " n"]:
+    """Largest angle between the closest view's ray to a sign and the rays of the views that count [rad]."""
+    towards = views.p_world_camera - fit.T_world_sign[views.sign, :3, 3]
+    ray = torch.nn.functional.normalize(towards, dim=-1)
+    closest = closest_view(towards.norm(dim=-1), views.sign)
+    across = torch.linalg.cross(ray, ray[closest][views.sign]).norm(dim=-1)
+    angle = torch.atan2(across, (ray * ray[closest][views.sign]).sum(-1))
+    angle = torch.where(counts, angle, torch.zeros_like(angle))
+    return torch.zeros_like(fit.cost).scatter_reduce(0, views.sign, angle, "amax")
+
+
+def _signs(
+    journey: Journey,
+    rows: Int[Tensor, " m"],
+    views: SignViews,
+    fit: SignFit,
+    shape: Int[Tensor, " n"],
+    label: Int[Tensor, " n"],
+    config: SignTriangulationConfig,
+) -> tuple[Signs, Int[Tensor, " n"]]:
+    """The table of all fitted signs, and by how much their corners were turned to start at the top left."""
+    n = len(shape)
+    T, size, turn = polygon.canonical_with_shift(fit.T_world_sign, fit.size, shape)
+    away = (views.p_world_camera - fit.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
+    agrees = fit.error_sq < config.fit.tukey**2
+    detections = journey.signs[rows]
+    score = torch.where(detections.score.isnan(), torch.ones_like(away), detections.score)
+    evidence = group_sum(score * agrees, views.sign, n)
+    t_ns = journey.t_ns[views.frame]
+    first = torch.full((n,), torch.iinfo(torch.int64).max, device=shape.device)
+    last = torch.full((n,), torch.iinfo(torch.int64).min, device=shape.device)
+    none = torch.full((n,), -1, device=shape.device)
+    signs = Signs(
+        shape=shape,
+        type=group_mode(detections.type, torch.ones_like(score), views.sign, n),
+        T_world_sign=T,
+        size=size,
+        covariance=fit.covariance,
+        journey=none,
+        tracklet=label,
+        frame=views.frame[closest_view(away, views.sign)],
+        n_journeys=torch.ones_like(label),
+        n_observations=group_sum(agrees.long(), views.sign, n),
+        first_seen_ns=first.scatter_reduce(0, views.sign, t_ns, "amin"),
+        last_seen_ns=last.scatter_reduce(0, views.sign, t_ns, "amax"),
+        confidence=1 - torch.exp(-evidence / config.confident_frames),
+    )
+    return signs, turn
+
+
+def _turned(
+    journey: Journey,
+    tracklets: Tracklets,
+    shape: Int[Tensor, " count"],
+    label: Int[Tensor, " n"],
+    turn: Int[Tensor, " n"],
+) -> Tracklets:
+    """The tracklets with shifts to the corners of the signs, which start at the top left."""
+    turn_of = torch.zeros_like(shape).index_put((label,), turn)
+    assert tracklets.shift is not None
+    at = tracklets.label.clamp_min(0)
+    same = (tracklets.label >= 0) & (journey.signs.shape == shape[at])
+    count = polygon.corner_count(journey.signs.shape)
+    shift = torch.where(same, (tracklets.shift + turn_of[at]) % count, tracklets.shift)
+    return replace(tracklets, shift=shift)
+
+
+def _per_detection(journey: Journey) -> Float[Tensor, " d"]:
+    return torch.full_like(journey.signs.score, torch.nan)
+
+
+def _no_signs(journey: Journey) -> Signs:
+    none = journey.signs.row[:0]
+    like = journey.T_world_camera
+    return Signs(
+        shape=none,
+        type=none,
+        T_world_sign=like[:0],
+        size=like.new_zeros(0, 2),
+        covariance=like.new_zeros(0, 3, 3),
+        journey=none,
+        tracklet=none,
+        frame=none,
+        n_journeys=none,
+        n_observations=none,
+        first_seen_ns=none,
+        last_seen_ns=none,
+        confidence=like.new_zeros(0),
+    )

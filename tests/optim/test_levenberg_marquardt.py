@@ -1,0 +1,153 @@
+"""Levenberg-Marquardt: convergence, independent problems in one batch, reasons, kept linearisations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.linear import DenseBackend
+from crowdmap_torch.optim.linearize import autograd_jacobians, linearize, rows, term_costs
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
+from crowdmap_torch.optim.robust import Huber, Quadratic, Tukey, median_scale
+
+ROWS = 40
+
+
+def decay(x, t, y):
+    return (x[0] * torch.exp(x[1] * t) - y)[None]
+
+
+def curves(count, *, outliers=False, seed=0):
+    """Exponential curves to fit, one independent problem each, with true parameters."""
+    generator = torch.Generator().manual_seed(seed)
+    t = 3 * torch.rand(count, ROWS, dtype=torch.float64, generator=generator)
+    scale = torch.rand(count, 2, dtype=torch.float64, generator=generator)
+    true = torch.stack((1 + scale[:, 0], -0.5 - scale[:, 1]), dim=-1)
+    noise = 0.01 * torch.randn(count, ROWS, dtype=torch.float64, generator=generator)
+    y = true[:, :1] * torch.exp(true[:, 1:] * t) + noise
+    if outliers:
+        y[:, ::10] += 5
+    group = torch.arange(count)
+    term = CostTerm(
+        decay,
+        (("x", group.repeat_interleave(ROWS)),),
+        (t.flatten(), y.flatten()),
+        torch.full((count * ROWS,), 100.0, dtype=torch.float64),
+        Tukey(4.685) if outliers else Quadratic(),
+    )
+    return Problem({"x": Variable(2, euclidean, group)}, {"decay": term}, count), true
+
+
+def test_a_batch_gives_what_each_problem_gives_alone():
+    problem, true = curves(7)
+    start = true + 0.3
+    config = lm.LmConfig(cost_tolerance=1e-12)
+    together = lm.solve(problem, {"x": start}, config).values["x"]
+    for i in range(len(true)):
+        of_problem = torch.arange(i * ROWS, (i + 1) * ROWS)
+        alone = rows(problem.terms["decay"], of_problem)
+        alone = replace(alone, slots=(("x", torch.zeros(ROWS, dtype=torch.long)),))
+        single = Problem({"x": Variable(2, euclidean)}, {"decay": alone})
+        result = lm.solve(single, {"x": start[i : i + 1]}, config).values["x"]
+        torch.testing.assert_close(result[0], together[i], rtol=0, atol=1e-9)
+
+
+def test_outliers_do_not_move_a_tukey_fit():
+    problem, true = curves(100, outliers=True)
+    state = lm.solve(problem, {"x": true + 0.02}, lm.LmConfig())
+    # One hundredth of noise over 36 points: parameters are known to about 0.01, four sigma here.
+    assert (state.values["x"] - true).abs().max() < 0.08
+    assert state.done
+
+
+def test_the_cost_never_rises():
+    problem, true = curves(5, seed=3)
+    state = lm.init(problem, {"x": true * 3}, lm.LmConfig())
+    while not state.done:
+        after = lm.step(problem, state, lm.LmConfig())
+        assert (after.cost <= state.cost).all()
+        state = after
+
+
+def test_a_rejected_step_keeps_the_linearisation():
+    problem, true = curves(1, seed=2)
+    config = lm.LmConfig(initial_damping=1e-12)
+    state = lm.init(problem, {"x": true * torch.tensor([1.0, -8.0])}, config)
+    rejected = 0
+    while not state.done:
+        after = lm.step(problem, state, config)
+        if not bool(after.accepted):
+            rejected += 1
+            assert after.normal is not None
+            assert after.values is state.values
+        state = after
+    assert rejected
+    assert state.linearizations == state.iterations - rejected + (0 if state.accepted else 1)
+
+
+def test_a_start_that_is_not_finite_is_a_reason():
+    problem, true = curves(2)
+    start = true.clone()
+    start[1, 0] = torch.nan
+    state = lm.solve(problem, {"x": start}, lm.LmConfig())
+    assert "not finite" in state.reasons[1]
+    assert "converged" in state.reasons[0]
+
+
+def test_positive_numbers_stay_positive():
+    values = positive(torch.tensor([[0.5, 2.0]]), torch.tensor([[-50.0, 3.0]]))
+    assert (values > 0).all()
+
+
+@pytest.mark.parametrize("loss", [Quadratic(), Huber(1.345), Tukey(4.685)])
+def test_weights_are_the_derivative_of_the_loss(loss):
+    s = torch.linspace(0.01, 40, 200, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss.rho(s).sum(), s)
+    torch.testing.assert_close(gradient, loss.weight(s.detach()), rtol=1e-9, atol=1e-12)
+
+
+def test_median_scale_of_normal_noise_is_its_sigma():
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.7 * torch.randn(20000, dtype=torch.float64, generator=generator)
+    noise[::20] += 100
+    # Five percent of outliers raise the median by about seven percent.
+    assert 0.68 < float(median_scale(noise)) < 0.77
+    assert float(median_scale(noise[:0], floor=0.3)) == pytest.approx(0.3)
+
+
+def test_chunks_do_not_change_the_normal_equations():
+    problem, true = curves(9, outliers=True)
+    values = {"x": true + 0.1}
+    whole = DenseBackend().assemble(problem, values)
+    parts = DenseBackend(chunk_rows=17).assemble(problem, values)
+    torch.testing.assert_close(whole.hessian, parts.hessian)
+    torch.testing.assert_close(whole.gradient, parts.gradient)
+    torch.testing.assert_close(
+        whole.cost, term_costs(problem, values, chunk_rows=11)["decay"], rtol=1e-12, atol=0
+    )
+
+
+def test_the_gradient_is_that_of_the_cost():
+    problem, true = curves(3, outliers=True, seed=5)
+    x = (true + 0.05).requires_grad_()
+    cost = term_costs(problem, {"x": x})["decay"].sum()
+    (expected,) = torch.autograd.grad(cost, x)
+    with torch.no_grad():
+        found = DenseBackend().assemble(problem, {"x": x.detach()}).gradient
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_autograd_jacobians_go_through_the_retraction():
+    problem, true = curves(2)
+    kinds = {"x": Variable(2, positive, torch.arange(2))}
+    _, (by_tangent,) = autograd_jacobians(problem.terms["decay"], kinds, {"x": true.abs()})
+    _, (by_value,) = autograd_jacobians(
+        problem.terms["decay"], dict(problem.variables), {"x": true.abs()}
+    )
+    block = problem.terms["decay"].slots[0][1]
+    torch.testing.assert_close(by_tangent, by_value * true.abs()[block][:, None])
+    linear = linearize(problem.terms["decay"], kinds, {"x": true.abs()})
+    torch.testing.assert_close(linear.jacobians[0], 100 * by_tangent)
