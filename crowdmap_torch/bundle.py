@@ -44,7 +44,7 @@ class AdjustConfig:
     """Bundle adjustment (V-B)."""
 
     lm: lm.LmConfig = field(
-        default_factory=lambda: lm.LmConfig(max_iterations=30, cost_tolerance=1e-4)
+        default_factory=lambda: lm.LmConfig(max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9)
     )
     """The solver; its tolerance counts once the scales stand still."""
     prior: PosePriorConfig = field(default_factory=PosePriorConfig)
@@ -61,10 +61,12 @@ class AdjustConfig:
     """How well the road under the car tells a marker's height."""
     lane_gate_m: float = 0.9
     """Lane points further from every lane than this, before adjustment, are left out."""
-    lane_slide_sigma_m: float = 0.5
-    """Prior of control points along the marker."""
-    lane_shift_sigma_m: float = 1.5
-    """Prior of control points across the marker and upwards: weak, for stretches hardly seen."""
+    lane_step_sigma_m: tuple[float, float, float] = (0.2, 0.5, 0.3)
+    """How much the step from one control point to the next may change: along the marker, across it, upwards."""
+    lane_place_sigma_m: float = 30.0
+    """Prior of a control point's place: only there to keep a marker that nothing holds."""
+    lane_slide_m: float = 0.3
+    """How far a control point may about slide along its marker in one step of the solver."""
     drift_spacing_m: float = 2.0
     """Stretch over which the drift of the poses is taken to stand still."""
     keyframe_spacing_m: float = 2.0
@@ -109,6 +111,7 @@ class Bundle(nn.Module):
         lane_count: Int[Tensor, " n"],
         frame: Int[Tensor, " p"],
         nodes: DriftNodes,
+        beside: Int[Tensor, " c"],
         config: AdjustConfig,
     ) -> None:
         super().__init__()
@@ -129,6 +132,10 @@ class Bundle(nn.Module):
         """Frame of each pose, counted over all journeys."""
         self.nodes = nodes
         self.lane_rows: Tensor | None = None
+        self.held: CostTerm | None = None
+        self.beside = beside
+        """The pose nearest to each lane coefficient at the start."""
+        self.slide_slots: tuple[tuple[str, Tensor], ...] = ()
 
     def values(self) -> dict[str, Tensor]:
         """Base values moved by the increments."""
@@ -175,15 +182,35 @@ class Bundle(nn.Module):
                 self.lane_rows = rows
                 self.lane_slots = tuple(("lane", column.contiguous()) for column in rows.unbind(1))
             self.lane_weight = weight
+            self._hold_slides(values)
         seen = self._residual_scales(values)
         narrowed = torch.minimum(self.scale, seen)
         at_rest = bool((narrowed > 0.97 * self.scale).all())
         self.scale.copy_(narrowed)
         return at_rest
 
-    def problem(self) -> Problem:
-        """The least-squares problem with the matches and scales of the moment."""
+    def _hold_slides(self, values: dict[str, Tensor]) -> None:
+        """Keeps lanes from sliding along themselves within a step: nothing in the images says where they are.
+
+        The hold is at the place of the moment, so it does not pull; the map's covariance is taken without it.
+        """
+        index = torch.arange(len(self.beside), device=self.beside.device)
+        self.slide_slots = self.slide_slots or (("pose", self.beside), ("lane", index))
+        offset = values["lane"] - values["pose"][self.beside, :3, 3]
+        along = self.fixed["lane_prior"].constants[1][:, :, 0]
+        self.held = CostTerm(
+            residuals.lane_slide,
+            self.slide_slots,
+            (offset, along),
+            offset.new_full((len(offset),), 1 / self.config.lane_slide_m),
+            jacobian=residuals.lane_slide_jacobian,
+        )
+
+    def problem(self, *, held: bool = True) -> Problem:
+        """The least-squares problem with the matches and scales of the moment; lanes `held` where they are, or not."""
         terms = dict(self.fixed)
+        if held and self.held is not None:
+            terms["lane_slide"] = self.held
         terms.update(self._corner_term(float(self.scale[0])))
         terms.update(self._lane_terms(float(self.scale[1]) * self.config.lane_correlation))
         return Problem(self.variables, terms)

@@ -7,7 +7,7 @@ import json
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,11 +25,15 @@ from crowdmap_torch.stages.signs import SignTriangulationConfig
 
 Config = TypeVar("Config")
 
+METHODS = ("joint", "paper2017")
+
 
 @dataclass(frozen=True)
 class MapperConfig:
     """Everything that can be set; a YAML file names only what differs from the defaults."""
 
+    method: str = "joint"
+    """`joint`: ours; `paper2017`: all of the paper's choices together, whatever the stages' own `method` says."""
     sign_association: SignAssociationConfig = field(default_factory=SignAssociationConfig)
     """IV-A, signs."""
     lane_association: LaneAssociationConfig = field(default_factory=LaneAssociationConfig)
@@ -53,6 +57,24 @@ class MapperConfig:
     min_confidence: float = 0.5
     """Signs below this go to tentative_signs.parquet."""
 
+    def __post_init__(self) -> None:
+        """Refuses an unknown method."""
+        if self.method not in METHODS:
+            raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
+
+    def resolved(self) -> MapperConfig:
+        """The configuration with every stage's method set to the paper's, if that is the method of all."""
+        if self.method != "paper2017":
+            return self
+        return replace(
+            self,
+            sign_association=replace(self.sign_association, method="epipolar"),
+            lane_association=replace(self.lane_association, method="epipolar"),
+            road=replace(self.road, method="paper2017"),
+            lane=replace(self.lane, method="paper2017"),
+            crowd=replace(self.crowd, method="paper2017"),
+        )
+
 
 def load_config(path: Path | str | None) -> MapperConfig:
     """The configuration of a YAML file, or the defaults; ValueError names the file, the key and what was expected."""
@@ -65,24 +87,34 @@ def load_config(path: Path | str | None) -> MapperConfig:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); name a YAML file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
-    return parse(MapperConfig, {} if content is None else content, where=str(path))
+    return changed(MapperConfig(), {} if content is None else content, where=str(path))
 
 
-def parse(kind: type[Config], content: Any, *, where: str) -> Config:
-    """A config dataclass from nested mappings; an unknown key or a value of the wrong type is a ValueError."""
+def changed(default: Config, content: Any, *, where: str) -> Config:
+    """The config dataclass `default` with what nested mappings say.
+
+    An unknown key or a value of the wrong type is a ValueError.
+    """
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: expected keys and values, found {content!r}")
-    known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(kind)
+    known = {f.name for f in fields(default)}  # type: ignore[arg-type]
+    hints = typing.get_type_hints(type(default))
     given = {}
     for key, value in content.items():
         if key not in known:
             raise ValueError(
                 f"{where}: unknown key {key!r}; expected one of {', '.join(sorted(known))}"
             )
-        given[key] = _value(hints[key], value, where=f"{where}: {key}")
+        here = f"{where}: {key}"
+        # A stage may start from other defaults than those of the class of its field: they stay.
+        inner = getattr(default, key)
+        given[key] = (
+            changed(inner, value, where=here)
+            if is_dataclass(inner)
+            else _value(hints[key], value, where=here)
+        )
     try:
-        return kind(**given)
+        return replace(default, **given)  # type: ignore[type-var]
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
@@ -104,8 +136,6 @@ def config_hash(config: MapperConfig) -> str:
 
 
 def _value(hint: Any, value: Any, *, where: str) -> Any:
-    if is_dataclass(hint):
-        return parse(typing.cast(type, hint), value, where=where)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:

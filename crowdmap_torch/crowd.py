@@ -35,12 +35,12 @@ from crowdmap_torch.stages.existence import (
 )
 from crowdmap_torch.stages.match import (
     SignMatchConfig,
-    harvest_signs,
+    join_leftovers,
     match_signs,
-    merge_heads,
     split_by_conflicts,
     without_small,
 )
+from crowdmap_torch.stages.merge import SignMergeConfig, dissolve_weak, join_passes, merge_heads
 from crowdmap_torch.stages.suspects import (
     JourneyStatistics,
     SuspectConfig,
@@ -72,11 +72,13 @@ class CrowdConfig:
     stands_still: float = 0.001
     """`joint`: clusters stand still when at most this share of the signs changes."""
     min_journeys: int = 2
-    """Signs seen by fewer journeys are singles: kept apart as tentative (of one journey alone, its signs are the map)."""
+    """Signs seen by fewer are singles, kept apart as tentative (of a single journey, its signs are the map)."""
     cluster: SignClusterConfig = field(default_factory=SignClusterConfig)
     """Grouping from places alone."""
     match: SignMatchConfig = field(default_factory=SignMatchConfig)
     """Each journey's signs against the clusters."""
+    merge: SignMergeConfig = field(default_factory=SignMergeConfig)
+    """Clusters that are one sign."""
     vote: VoteConfig = field(default_factory=VoteConfig)
     """First biases."""
     align: AlignConfig = field(default_factory=AlignConfig)
@@ -262,15 +264,7 @@ def _associate_joint(crowd: CrowdSigns, config: CrowdConfig, generator: torch.Ge
         signs.journey, label, min_journeys=least_journeys, counts=weight[signs.journey] > 0
     )
     unbiased = with_covariance(unbiased_signs(crowd, bias), extra)
-    heads = rough_heads(unbiased, label, weight=weight[signs.journey])
-    sigma = least.new_full((3,), config.shift_sigmas_m[-1])
-    label = merge_heads(
-        unbiased, label, heads, crowd.seen_together, config.match, shift_sigma=sigma
-    )
-    label = renumber(label)
-    heads = rough_heads(unbiased, label, weight=weight[signs.journey])
-    label = harvest_signs(unbiased, label, heads, crowd.seen_together, config.match)
-    label = renumber(label)
+    label = _harvested(crowd, unbiased, label, weight[signs.journey], config)
     heads = sign_heads(unbiased, label, weight=weight[signs.journey])
     return _finished(
         crowd, label, heads, bias, suspects, weight, rounds, spectra, statistics, config
@@ -303,7 +297,7 @@ def _regroup(
     for _ in range(2):
         before = label = renumber(matches.label)
         heads = rough_heads(signs, label, weight=weight, shift_sigma=shift_sigma)
-        label = merge_heads(signs, label, heads, seen_together, config.match, shift_sigma=sigma)
+        label = merge_heads(signs, label, heads, seen_together, config.merge, shift_sigma=sigma)
         if not torch.equal(before, label):
             label = renumber(label)
             heads = rough_heads(signs, label, weight=weight, shift_sigma=shift_sigma)
@@ -312,6 +306,28 @@ def _regroup(
             break
     label = without_small(signs.journey, matches.label, min_journeys=2)
     return label, matches.certainty, found.report.spectra
+
+
+def _harvested(
+    crowd: CrowdSigns,
+    unbiased: Signs,
+    label: Int[Tensor, " n"],
+    weight: Float[Tensor, " n"],
+    config: CrowdConfig,
+) -> Int[Tensor, " n"]:
+    """Labels with duplicate clusters joined and signs that were left over brought back."""
+    together = crowd.seen_together
+    sigma = weight.new_full((3,), config.shift_sigmas_m[-1])
+    heads = rough_heads(unbiased, label, weight=weight)
+    label = merge_heads(unbiased, label, heads, together, config.merge, shift_sigma=sigma)
+    label = renumber(label)
+    heads = rough_heads(unbiased, label, weight=weight)
+    label = join_passes(unbiased, label, heads, crowd.station, together, config.merge)
+    label = renumber(label)
+    heads = rough_heads(unbiased, label, weight=weight)
+    label = renumber(dissolve_weak(unbiased, label, heads, together, config.merge))
+    heads = rough_heads(unbiased, label, weight=weight)
+    return join_leftovers(unbiased, label, heads, together, config.match)
 
 
 def _round(shift_sigma: float, before: Int[Tensor, " n"], after: Int[Tensor, " n"]) -> CrowdRound:

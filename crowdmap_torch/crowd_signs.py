@@ -9,12 +9,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import pairs_within
+from crowdmap_torch.clustering.groups import distinct_pairs, pairs_within
 from crowdmap_torch.observations import station as along_track
 from crowdmap_torch.tables import Journey, Signs, Tracklets
 
 _FASTEST_MPS = 70.0
 """No car is faster [m/s]: a longer step between two frames is a fault of the positions."""
+
+_ONE_PLACE = 0.5
+"""Detections nearer to each other in the image than this share of the smaller one show one sign."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class CrowdSigns:
     view_direction: Float[Tensor, "n 3"]
     """Where it looked."""
     seen_together: Int[Tensor, "p 2"]
-    """Pairs of signs of one journey that were seen in one same frame: never one sign."""
+    """Pairs of signs of one journey that were seen beside each other in a frame: never one sign."""
     leap: Float[Tensor, " j"]
     """Largest step between two frames of each journey beyond what a car can drive [m]."""
     bias_sigma: Float[Tensor, "j 3"]
@@ -67,13 +70,13 @@ def gather_signs(
 ) -> CrowdSigns:
     """The signs of all journeys with when each was seen.
 
-    `signs.journey` and `signs.tracklet` index the two sequences. `bias_sigma_m` is the prior 1-sigma of a bias, east north
-    up [m], where the poses of a journey do not say.
+    `signs.journey` and `signs.tracklet` index the two sequences. `bias_sigma_m` is the prior 1-sigma of a bias, east
+    north up [m], where the poses of a journey do not say.
     """
     frame_offset = 0
     station = signs.confidence.new_zeros(len(signs))
     view = signs.T_world_sign.new_zeros(len(signs), 4, 4)
-    frame_key, seen_sign = [], []
+    frame_key, seen_sign, middle, extent = [], [], [], []
     leap = station.new_zeros(len(journeys))
     sigma = station.new_tensor(bias_sigma_m).repeat(len(journeys), 1)
     path: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -87,8 +90,12 @@ def gather_signs(
         row_of = torch.full((max(found.count, 1),), -1, dtype=rows.dtype, device=rows.device)
         row_of[signs.tracklet[rows]] = rows
         seen = torch.where(found.label >= 0, row_of[found.label.clamp_min(0)], -1)
-        frame_key.append(frame_offset + journey.signs.frame[seen >= 0])
+        shown = journey.signs[seen >= 0]
+        corners = shown.corners_ideal
+        frame_key.append(frame_offset + shown.frame)
         seen_sign.append(seen[seen >= 0])
+        middle.append((corners.amin(1) + corners.amax(1)) / 2)
+        extent.append((corners.amax(1) - corners.amin(1)).amax(1))
         frame_offset += journey.frame_count
         if journey.sigma_position is not None:
             sigma[j] = journey.sigma_position.median(0).values.clamp_min(0.05)
@@ -104,7 +111,13 @@ def gather_signs(
         station=station,
         view_position=view[:, :3, 3],
         view_direction=view[:, :3, 2],
-        seen_together=pairs_seen_together(torch.cat(seen_sign), torch.cat(frame_key), len(signs)),
+        seen_together=pairs_seen_together(
+            torch.cat(seen_sign),
+            torch.cat(frame_key),
+            torch.cat(middle),
+            torch.cat(extent),
+            len(signs),
+        ),
         leap=leap,
         bias_sigma=sigma,
         path_journey=owner,
@@ -114,13 +127,24 @@ def gather_signs(
 
 
 def pairs_seen_together(
-    sign: Int[Tensor, " d"], frame: Int[Tensor, " d"], n: int
+    sign: Int[Tensor, " d"],
+    frame: Int[Tensor, " d"],
+    middle: Float[Tensor, "d 2"],
+    extent: Float[Tensor, " d"],
+    n: int,
 ) -> Int[Tensor, "p 2"]:
-    """Pairs of the `n` signs that share a frame; `frame` numbers the frames of all journeys on."""
-    first, second = sign[pairs_within(frame)].T
-    low, high = torch.minimum(first, second), torch.maximum(first, second)
-    key = torch.unique((low * n + high)[low != high])
-    return torch.stack((key // max(n, 1), key % max(n, 1)), dim=1)
+    """Pairs of the `n` signs that were seen beside each other in a frame, from detections with their `middle` and size.
+
+    `frame` numbers the frames of all journeys on. Detections on top of each other are one sign detected twice: they do
+    not tell two signs apart.
+    """
+    first, second = pairs_within(frame).T
+    distance = (middle[first] - middle[second]).norm(dim=1)
+    beside = distance > _ONE_PLACE * torch.minimum(extent[first], extent[second])
+    a, b = sign[first[beside]], sign[second[beside]]
+    low, high, _ = distinct_pairs(torch.minimum(a, b), torch.maximum(a, b))
+    pairs = torch.stack((low, high), dim=1)
+    return pairs[low != high]
 
 
 def _largest_leap(journey: Journey) -> Float[Tensor, ""]:

@@ -91,7 +91,8 @@ def cut_by_length(
     piece_length = extent.clamp_max(length).clamp_min(1e-6)
     stride = (extent - piece_length) / (count - 1).clamp_min(1)
     first = count.cumsum(0) - count
-    # Every point is in the piece that began last before it, and in those before as far as they reach.
+    # Every point is in the piece that began last before it, and in those before as far as they
+    # reach.
     place = along - low[run]
     latest = (place / stride[run].clamp_min(1e-6)).floor().long().clamp_max(count[run] - 1)
     back = torch.arange(int(1 / (1 - overlap)) + 2, device=run.device)
@@ -164,9 +165,10 @@ def fit_pieces(
 ) -> LaneFit:
     """Splines by iterated least squares (Tukey), all pieces at once.
 
-    `sigma` is the lateral noise expected of each point [m]; `scales` are factors on it, one an iteration. `smoothing` is the price
-    of bending in units of a piece's whole weight. `refine` moves points once to the parameter nearest to them, which only
-    pieces without a known parameter need.
+    `sigma` is the lateral noise expected of each point [m]; `scales` are factors on it, one an
+    iteration. `smoothing` is the price of bending in units of a piece's whole weight. `refine`
+    moves points once to the parameter nearest to them, which only pieces without a known parameter
+    need.
     """
     count, piece = pieces.control_count, pieces.piece
     point, expected = point_world[pieces.point], sigma[pieces.point]
@@ -198,7 +200,9 @@ def fit_pieces(
 class _Basis:
     """The B-splines of points at fixed parameters: what stays the same while weights change."""
 
-    def __init__(self, t: Float[Tensor, " r"], piece: Int[Tensor, " r"], count: Int[Tensor, " n"]) -> None:
+    def __init__(
+        self, t: Float[Tensor, " r"], piece: Int[Tensor, " r"], count: Int[Tensor, " n"]
+    ) -> None:
         zero = torch.zeros_like(piece)
         self.piece, self.count = piece, count
         self.slot, self.w, self.dw = spline.window_flat(t, zero, count[piece])

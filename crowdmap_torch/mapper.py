@@ -151,6 +151,7 @@ def map_journeys(
 @torch.no_grad()
 def map_journey(journey: Journey, number: int, config: MapperConfig) -> JourneyMap:
     """Section IV: the signs and lanes of one journey, the `number`-th of the dataset."""
+    config = config.resolved()
     tracklets = associate_signs(journey, config.sign_association)
     signs, sign_report = triangulate_signs(journey, tracklets, config.sign_triangulation)
     road = estimate_road(journey, config.road)
@@ -172,6 +173,7 @@ def first_map(
     journeys: Sequence[Journey], maps: Sequence[JourneyMap], config: MapperConfig
 ) -> FirstMap:
     """Section V-A: landmarks of many journeys in clusters, the journeys' biases, and the cluster heads."""
+    config = config.resolved()
     gathered = gather_signs(
         journeys,
         [m.sign_tracklets for m in maps],
@@ -218,6 +220,7 @@ def build_bundle(
         first.associations,
         first.drifts,
         config.adjust,
+        left_out=[suspect.journey for suspect in first.crowd.report.suspects],
     )
 
 

@@ -16,8 +16,6 @@ from crowdmap_torch.optim.problem import CostTerm
 
 ANCHOR_SIGMA_M = 1e-3
 """How tightly the drift is held at zero at the closest view."""
-TYPICAL_SPEED = 15.0
-"""Turns the time between two passes of a landmark into a way [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +26,6 @@ class DriftConfig:
     """Standard deviation over one metre, per axis; it grows with the square root of the way."""
     sigma_rad: float = 3.7e-4
     """The same of rotations."""
-    limit_m: float = 0.35
-    """Standard deviation between views however far apart."""
     knot_m: float = 4.0
     """Distance between the knots of the polyline."""
     max_knots: int = 20
@@ -38,15 +34,13 @@ class DriftConfig:
 
 @dataclass(frozen=True)
 class DriftKnots:
-    """Knots of the drift of every pass of every landmark, those of one pass adjacent and in order."""
+    """Knots of the drift around every landmark, those of one landmark adjacent and in order."""
 
     landmark: Int[Tensor, " k"]
     is_last: Bool[Tensor, " k"]
-    """No further knot of the pass follows."""
-    anchor: Int[Tensor, " p"]
-    """The knot at each pass's closest view."""
-    anchor_sigma: Float[Tensor, " p"]
-    """1-sigma of the drift there [m]: next to nothing, or what poses drift between two passes."""
+    """No further knot of the landmark follows."""
+    anchor: Int[Tensor, " n"]
+    """The knot at each landmark's closest view."""
     before: Int[Tensor, " m"]
     """The knot before each view; the one after it is the next."""
     share: Float[Tensor, " m"]
@@ -84,39 +78,24 @@ def closest_view(away: Float[Tensor, " m"], group: Int[Tensor, " m"]) -> Int[Ten
 
 
 def place_knots(
-    distance: Float[Tensor, " m"],
-    away: Float[Tensor, " m"],
-    t_s: Float[Tensor, " m"],
-    landmark: Int[Tensor, " m"],
-    part: Int[Tensor, " m"],
-    config: DriftConfig,
+    distance: Float[Tensor, " m"], landmark: Int[Tensor, " m"], config: DriftConfig
 ) -> DriftKnots:
-    """Knots for views at signed `distance` from the closest view of their pass `part` of a landmark."""
+    """Knots for views at signed `distance` from the closest view of their landmark; every landmark must have a view."""
     position = (distance / config.knot_m).clamp(-config.max_knots, config.max_knots)
-    passes = len(torch.bincount(part))
-    zero = position.new_zeros(passes)
-    low = zero.scatter_reduce(0, part, position, "amin").floor().long()
-    high = zero.scatter_reduce(0, part, position, "amax").ceil().long()
+    zero = torch.zeros_like(torch.bincount(landmark), dtype=position.dtype)
+    low = zero.scatter_reduce(0, landmark, position, "amin").floor().long()
+    high = zero.scatter_reduce(0, landmark, position, "amax").ceil().long()
     count = (high - low + 1).clamp_min(2)
     first = count.cumsum(0) - count
-    is_last = torch.zeros(int(count.sum()), dtype=torch.bool, device=part.device)
+    is_last = torch.zeros(int(count.sum()), dtype=torch.bool, device=landmark.device)
     is_last[first + count - 1] = True
-
-    nearest = closest_view(away, part)
-    landmark_of_part = landmark[nearest]
-    placing = nearest[closest_view(away[nearest], landmark_of_part)][landmark_of_part]
-    silent_s = (t_s[nearest] - t_s[placing]).abs()
-    anchor_sigma = (config.sigma_m * (TYPICAL_SPEED * silent_s).sqrt()).clamp(
-        ANCHOR_SIGMA_M, config.limit_m
-    )
-    rank = torch.minimum(position.floor().long() - low[part], count[part] - 2)
+    rank = torch.minimum(position.floor().long() - low[landmark], count[landmark] - 2)
     return DriftKnots(
-        landmark=torch.repeat_interleave(landmark_of_part, count),
+        landmark=torch.repeat_interleave(torch.arange(len(count), device=first.device), count),
         is_last=is_last,
         anchor=first - low,
-        anchor_sigma=anchor_sigma,
-        before=first[part] + rank,
-        share=position - low[part] - rank,
+        before=first[landmark] + rank,
+        share=position - low[landmark] - rank,
     )
 
 
@@ -152,7 +131,7 @@ def drift_terms(knots: DriftKnots, config: DriftConfig) -> dict[str, CostTerm]:
         "drift_anchor": CostTerm(
             drift_anchor,
             (("drift", knots.anchor),),
-            weight=1 / knots.anchor_sigma,
+            weight=torch.full_like(knots.anchor, 1, dtype=knots.share.dtype) / ANCHOR_SIGMA_M,
             jacobian=anchor_jacobian,
         ),
     }

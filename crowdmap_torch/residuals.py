@@ -93,11 +93,36 @@ def lane_prior(
     start: Float[Tensor, " 3"],
     R_world_lane: Float[Tensor, "3 3"],
 ) -> Float[Tensor, " 3"]:
-    """Displacement of a spline coefficient from its start, along the lane, across it and upwards [m].
-
-    Observations say nothing about sliding along the marker; without this the coefficients would drift there.
-    """
+    """Displacement of a spline coefficient from its start, along the lane, across it and upwards [m]."""
     return R_world_lane.mT @ (coefficient - start)
+
+
+def lane_stretch(
+    c0: Float[Tensor, " 3"],
+    c1: Float[Tensor, " 3"],
+    start: Float[Tensor, " 3"],
+    R_world_lane: Float[Tensor, "3 3"],
+) -> Float[Tensor, " 3"]:
+    """Change of the step between two neighbouring coefficients, along the lane, across it and upwards [m].
+
+    `start` is the step at first. Observations say nothing about sliding along the marker, and little where it is hardly
+    seen; a marker may slide as a whole, but its coefficients neither bunch nor tear.
+    """
+    return R_world_lane.mT @ (c1 - c0 - start)
+
+
+def lane_slide(
+    T_world_camera: Float[Tensor, "4 4"],
+    coefficient: Float[Tensor, " 3"],
+    offset: Float[Tensor, " 3"],
+    along: Float[Tensor, " 3"],
+) -> Float[Tensor, " 1"]:
+    """How far a coefficient has slid along its marker, against a camera that drove by [m].
+
+    Held between steps only, at the `offset` of the moment. Against a camera and not against the world: the map may
+    shift as a whole, and the journeys' positions must not be counted twice.
+    """
+    return (along @ (coefficient - T_world_camera[:3, 3] - offset))[None]
 
 
 def pose_deviation(
@@ -225,6 +250,29 @@ def lane_prior_jacobian(
     """`lane_prior` and its Jacobian by the coefficient."""
     R_t = R_world_lane.mT
     return (R_t @ (coefficient - start)[..., None])[..., 0], (R_t,)
+
+
+def lane_stretch_jacobian(
+    c0: Float[Tensor, "m 3"],
+    c1: Float[Tensor, "m 3"],
+    start: Float[Tensor, "m 3"],
+    R_world_lane: Float[Tensor, "m 3 3"],
+) -> tuple[Float[Tensor, "m 3"], tuple[Tensor, Tensor]]:
+    """`lane_stretch` and its Jacobians by the two coefficients."""
+    R_t = R_world_lane.mT
+    return (R_t @ (c1 - c0 - start)[..., None])[..., 0], (-R_t, R_t)
+
+
+def lane_slide_jacobian(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    coefficient: Float[Tensor, "m 3"],
+    offset: Float[Tensor, "m 3"],
+    along: Float[Tensor, "m 3"],
+) -> tuple[Float[Tensor, "m 1"], tuple[Tensor, Tensor]]:
+    """`lane_slide` and its Jacobians by camera pose and coefficient."""
+    change = coefficient - T_world_camera[:, :3, 3] - offset
+    by_pose = torch.nn.functional.pad(-along, (0, 3))
+    return (along * change).sum(-1, keepdim=True), (by_pose[:, None], along[:, None])
 
 
 def pose_deviation_jacobian(

@@ -11,7 +11,7 @@ from pathlib import Path
 from crowdmap_torch import __version__
 from crowdmap_torch.config import MapperConfig, dump
 from crowdmap_torch.evaluate import MapFigures, evaluate_map, refuse_other_origin
-from crowdmap_torch.evaluation.evidence import gather_evidence
+from crowdmap_torch.evaluation.evidence import read_journey_landmarks
 from crowdmap_torch.io.atomic import atomic_file, atomic_folder
 from crowdmap_torch.io.landmarks import write_lanes, write_signs
 from crowdmap_torch.io.maps import write_map
@@ -22,6 +22,7 @@ from crowdmap_torch.io.runs import (
     write_road,
 )
 from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.io.truth import Truth, has_truth, read_associations, read_truth
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.tables import Dataset, HdMap, Origin, Survey
 
@@ -104,22 +105,28 @@ def read_survey_of(dataset_folder: Path, origin: Origin) -> Survey | None:
     return survey
 
 
+def read_truth_of(dataset_folder: Path, dataset: Dataset, survey: Survey | None) -> Truth | None:
+    """What a simulation knows of the journeys in use, for the scores alone; ValueError if it cannot be read."""
+    folder = dataset_folder / "survey"
+    if survey is None or not has_truth(folder):
+        return None
+    return read_truth(folder, survey, dataset.journeys)
+
+
 def figures_of(
-    hd_map: HdMap, survey: Survey, dataset_folder: Path, run: RunFolder | None
+    hd_map: HdMap, survey: Survey, truth: Truth | None, run: RunFolder | None
 ) -> MapFigures:
     """METRICS.md's figures of a map; with a run's folder those of associations and single journeys too."""
-    evidence = gather_evidence(
-        hd_map,
-        survey,
-        dataset_folder / "survey",
-        dataset_folder=dataset_folder,
-        run_folder=None if run is None else run.path,
-    )
+    if truth is None:
+        note = "no truth with the survey: every surveyed sign is observable"
+        return evaluate_map(hd_map, survey, notes=(note,))
+    if run is None:
+        return evaluate_map(hd_map, survey, truth=truth)
+    ids = [t.journey.journey_id for t in truth.journeys]
     return evaluate_map(
         hd_map,
         survey,
-        truth=evidence.truth,
-        associations=evidence.associations,
-        landmarks=evidence.landmarks,
-        notes=evidence.notes,
+        truth=truth,
+        associations=read_associations(run.path / "associations.parquet", ids),
+        landmarks=read_journey_landmarks(run.path, ids),
     )

@@ -41,6 +41,9 @@ class SignFitConfig:
     """Noise of each corner of a large detection, per axis [px]."""
     small_box_px: float = 12.0
     """Box at which that noise has grown by a factor of 1.41 [px]."""
+    box_sigma: float = 0.5
+    """Noise of width and height of detections that are axis-aligned boxes, as a share: boxes are drawn around a sign, wider
+    than its outline where it is seen at an angle."""
     max_noise_scale: float = 4.0
     """The noise of each sign's corners is estimated from its own residuals, up to this multiple of the above."""
     pose_sigma_m: float = 0.016
@@ -72,8 +75,6 @@ class SignViews(Rows):
 
     sign: Int[Tensor, " m"]
     """Row of the sign that each detection shows."""
-    part: Int[Tensor, " m"]
-    """Pass of the sign, counted over all signs: views of one pass share a drift."""
     frame: Int[Tensor, " m"]
     t_s: Float[Tensor, " m"]
     """Time since the journey began [s]."""
@@ -137,8 +138,8 @@ def fit_signs(
     zero instead, views that are off to the side would make the sign seem further away than it is.
     """
     away = (views.p_world_camera - start.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
-    distance = signed_distance(views.p_world_camera, away, views.frame, views.part)
-    knots = place_knots(distance, away, views.t_s, views.sign, views.part, config.drift)
+    distance = signed_distance(views.p_world_camera, away, views.frame, views.sign)
+    knots = place_knots(distance, views.sign, config.drift)
     drift = start.size.new_zeros(len(knots.landmark), 3)
     pose_error = start.size.new_zeros(len(views), 6)
     # What the polyline leaves of a random walk between two knots, on average.
@@ -379,10 +380,20 @@ def _noise(
     pixel = config.sigma_px**2 * (1 + (config.small_box_px / box).square())
     covariance = (by_pose * variance[:, None]) @ by_pose.mT
     covariance.diagonal(dim1=-2, dim2=-1).add_((pixel * noise_scale[at].square())[:, None])
+    by_scale = _box_scales(views.corners_px) * config.box_sigma
+    covariance = covariance + by_scale @ by_scale.mT
     factor = torch.linalg.cholesky(covariance)
     eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
     whitening = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
     return _Noise(whitening, by_pose, variance, pose_error)
+
+
+def _box_scales(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, "m 16 2"]:
+    """Derivatives of the corners by the logarithms of the box's width and height; zero for outlines that are no boxes."""
+    low, high = corners_px.amin(1, keepdim=True), corners_px.amax(1, keepdim=True)
+    is_box = ((corners_px == low) | (corners_px == high)).all(-1).all(-1)
+    offset = (corners_px - (low + high) / 2) * is_box[:, None, None]
+    return torch.diag_embed(offset).flatten(1, 2)
 
 
 def _corner_errors(
@@ -411,7 +422,7 @@ def _corner_errors(
 
 def _distance(views: SignViews, start: SignStart) -> Float[Tensor, " m"]:
     away = (views.p_world_camera - start.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
-    return signed_distance(views.p_world_camera, away, views.frame, views.part)
+    return signed_distance(views.p_world_camera, away, views.frame, views.sign)
 
 
 def _pose_error(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.tables import Signs
@@ -70,3 +70,18 @@ def place_distance(
     return mahalanobis(
         center_a - center_b, covariance_a + covariance_b + torch.diag(sigma.square())
     )
+
+
+def sign_distance(
+    a: Signs,
+    b: Signs,
+    pair: Int[Tensor, "p 2"],
+    config: SimilarityConfig,
+    sigma: Float[Tensor, " 3"],
+) -> Float[Tensor, " p"]:
+    """Squared distance, in place and appearance, of the rows of `a` and `b` that `pair` names; `sigma` as above."""
+    first, second = a[pair[:, 0]], b[pair[:, 1]]
+    place = place_distance(
+        first.center_world, first.covariance, second.center_world, second.covariance, sigma
+    )
+    return place + appearance_distance(first, second, config)

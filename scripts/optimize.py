@@ -23,7 +23,7 @@ from crowdmap_torch.report.html import write_report
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.report.watch import Watch
-from crowdmap_torch.run_folder import RunFolder, figures_of, read_survey_of
+from crowdmap_torch.run_folder import RunFolder, figures_of, read_survey_of, read_truth_of
 from crowdmap_torch.run_metrics import metrics_of, record_of
 from crowdmap_torch.stages import adjust
 
@@ -37,6 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
         device = _device(options.device)
         dataset = load_dataset(options.dataset, device=device, strict=options.strict)
         survey = read_survey_of(options.dataset, dataset.origin)
+        truth = read_truth_of(options.dataset, dataset, survey)
     except ValueError as error:
         print(f"optimize.py: {error}", file=sys.stderr)
         return 2
@@ -61,9 +62,12 @@ def main(arguments: list[str] | None = None) -> int:
         bundle = mapper.build_bundle(journeys, maps, first, config)
         start = 0
         if options.resume and run.checkpoint.exists():
-            start = load_checkpoint(
-                run.checkpoint, bundle, config_hash=config_hash(config)
-            ).iteration
+            try:
+                saved = load_checkpoint(run.checkpoint, bundle, config_hash=config_hash(config))
+            except ValueError as error:
+                print(f"optimize.py: {error}", file=sys.stderr)
+                return 2
+            start = saved.iteration
         state = adjust.start(bundle)
         backend = bundle.backend()
         watch = Watch(log, survey, first.signs, first.lanes, every=options.log_every)
@@ -93,8 +97,8 @@ def main(arguments: list[str] | None = None) -> int:
             mapper.certain_part(m, config.min_confidence)
             for m in (result.hd_map, result.map_clusters)
         )
-        figures = figures_of(final, survey, options.dataset, run)
-        figures_before = figures_of(before, survey, options.dataset, None)
+        figures = figures_of(final, survey, truth, run)
+        figures_before = figures_of(before, survey, truth, None)
         print(format_figures(figures))
     progress.finish()
     seconds, compared = progress.seconds, (figures, figures_before)

@@ -18,6 +18,16 @@ if os.environ.get("CROWDMAP_CHECK_SHAPES"):
     # Every jaxtyping annotation of the package is checked at run time: slower, and worth a run now and then.
     install_import_hook("crowdmap_torch", "shape_checks.checked")
 
+# Imported after the hook, which sees only what is imported behind it.
+from drives import write_tiny
+
+from crowdmap_torch import mapper
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.io.truth import Truth, read_truth
+from crowdmap_torch.tables import Dataset, Survey
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -43,3 +53,33 @@ def real_data() -> Callable[[str], Path]:
 def generator() -> torch.Generator:
     """The same random numbers for every test that draws some."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated dataset of three short journeys on disk; tests that change it copy it first."""
+    return write_tiny(tmp_path_factory.mktemp("tiny") / "dataset")
+
+
+@pytest.fixture(scope="session")
+def tiny(tiny_folder: Path) -> Dataset:
+    """The same dataset, loaded."""
+    return load_dataset(tiny_folder)
+
+
+@pytest.fixture(scope="session")
+def tiny_survey(tiny_folder: Path) -> Survey:
+    """Its survey."""
+    return read_survey(tiny_folder / "survey")
+
+
+@pytest.fixture(scope="session")
+def tiny_truth(tiny_folder: Path, tiny: Dataset, tiny_survey: Survey) -> Truth:
+    """The truth of its journeys."""
+    return read_truth(tiny_folder / "survey", tiny_survey, tiny.journeys)
+
+
+@pytest.fixture(scope="session")
+def tiny_result(tiny: Dataset) -> mapper.MapResult:
+    """Its map with the default configuration."""
+    return mapper.build_map(tiny, MapperConfig())

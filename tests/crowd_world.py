@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from crowdmap_torch.crowd_signs import CrowdSigns, pairs_seen_together
-from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.tables import Signs
 
 _SEEN_FROM_M, _SEEN_TO_M = 55.0, 8.0
@@ -152,7 +152,9 @@ def make_world(
         station=closest,
         view_position=view + torch.tensor([0.0, -1.5, 1.4]),
         view_direction=forward[:, None] * east,
-        seen_together=pairs_seen_together(rows, frame, n),
+        seen_together=pairs_seen_together(
+            rows, frame, rows[:, None] * torch.tensor([1.0, 0.0]), torch.ones(len(rows)), n
+        ),
         leap=torch.zeros(journeys, dtype=torch.float64),
         bias_sigma=torch.tensor([bias_m, bias_m, 1.41 * bias_m]).double().repeat(journeys, 1),
         path_journey=torch.repeat_interleave(torch.arange(journeys), len(step)),
@@ -223,3 +225,31 @@ def shuffled(world: World, seed: int) -> tuple[World, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(world.sign), generator=generator)
     return _reordered(world, order), order
+
+
+def signs_at(place: list[tuple[float, float, float]], journey: list[int]) -> Signs:
+    """Equal octagons that face west."""
+    n = len(place)
+    one = torch.ones(n, dtype=torch.int64)
+    R = torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]).double()
+    return Signs(
+        shape=one * polygon.OCTAGON,
+        type=-one,
+        T_world_sign=se3.make(R.expand(n, 3, 3), torch.tensor(place, dtype=torch.float64)),
+        size=torch.full((n, 2), 0.6, dtype=torch.float64),
+        covariance=0.01 * torch.eye(3).double().expand(n, 3, 3),
+        journey=torch.tensor(journey),
+        tracklet=torch.arange(n),
+        frame=0 * one,
+        n_journeys=one,
+        n_observations=10 * one,
+        first_seen_ns=0 * one,
+        last_seen_ns=0 * one,
+        confidence=one.double(),
+    )
+
+
+def turned_round(signs: Signs) -> Signs:
+    """The same signs seen from behind: facing the other way."""
+    half = torch.diag(torch.tensor([-1.0, 1, -1, 1])).double()
+    return replace(signs, T_world_sign=signs.T_world_sign @ half)

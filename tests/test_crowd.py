@@ -186,8 +186,11 @@ def test_no_signs_at_all_are_an_empty_crowd():
         assert len(found.heads) == len(found.tentative) == 0
 
 
-def test_pairs_seen_together_share_a_frame():
-    sign = torch.tensor([0, 1, 2, 2, 3, 1, 0])
-    frame = torch.tensor([0, 0, 0, 1, 1, 2, 3])
-    pairs = pairs_seen_together(sign, frame, 5)
+def test_pairs_seen_together_are_beside_each_other_in_a_frame():
+    sign = torch.tensor([0, 1, 2, 2, 3, 1, 0, 4])
+    frame = torch.tensor([0, 0, 0, 1, 1, 2, 3, 3])
+    u = torch.tensor([0.0, 0.1, 0.3, 0.3, 0.4, 0.1, 0.0, 0.02])
+    extent = torch.full((8,), 0.06)
+    pairs = pairs_seen_together(sign, frame, torch.stack((u, 0 * u), dim=1), extent, 5)
+    # Signs 0 and 4 lie on top of each other in frame 3: one sign detected twice.
     assert pairs.tolist() == [[0, 1], [0, 2], [1, 2], [2, 3]]

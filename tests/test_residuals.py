@@ -114,6 +114,20 @@ def test_lane_height_and_prior_jacobians_equal_autograd(scene, generator):
         (add,),
         (coefficients[0], T_world_camera[:, :3, :3]),
     )
+    check(
+        residuals.lane_slide,
+        residuals.lane_slide_jacobian,
+        (T_world_camera, ahead),
+        (se3.retract, add),
+        (coefficients[0], normal),
+    )
+    check(
+        residuals.lane_stretch,
+        residuals.lane_stretch_jacobian,
+        (ahead, coefficients[1]),
+        (add, add),
+        (coefficients[0], T_world_camera[:, :3, :3]),
+    )
 
 
 @pytest.mark.parametrize("spread", [0.0, 1e-4, 0.3])

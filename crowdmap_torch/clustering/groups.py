@@ -10,8 +10,8 @@ from torch import Tensor
 
 
 def group_sum(
-    value: Float[Tensor, n * rest], label: Int[Tensor, " n"], groups: int
-) -> Float[Tensor, g * rest]:
+    value: Float[Tensor, "n ..."], label: Int[Tensor, " n"], groups: int
+) -> Float[Tensor, "g ..."]:
     """Sum over each group; zero for an empty one."""
     used = label >= 0
     total = value.new_zeros(groups, *value.shape[1:])
@@ -24,8 +24,8 @@ def group_count(label: Int[Tensor, " n"], groups: int) -> Int[Tensor, " g"]:
 
 
 def group_median(
-    value: Float[Tensor, n * rest], label: Int[Tensor, " n"], groups: int
-) -> Float[Tensor, g * rest]:
+    value: Float[Tensor, "n ..."], label: Int[Tensor, " n"], groups: int
+) -> Float[Tensor, "g ..."]:
     """Median over each group, column by column; of an even number the mean of the middle two; NaN for an empty one."""
     used = label >= 0
     key = label[used]
@@ -64,6 +64,18 @@ def group_mode(
     first[1:] = owner[1:] != owner[:-1]
     result[owner[first]] = (key[order] % span)[first].to(code.dtype)
     return result
+
+
+def cheapest(
+    row: Int[Tensor, " p"], other: Int[Tensor, " p"], cost: Float[Tensor, " p"], rows: int
+) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
+    """The least cost of each row and the partner it comes with, the smaller of equals; infinity and -1 without one."""
+    best = cost.new_full((rows,), torch.inf).scatter_reduce(0, row, cost, "amin")
+    is_best = (cost == best[row]) & cost.isfinite()
+    far = torch.iinfo(torch.int64).max
+    partner = torch.full((rows,), far, dtype=torch.int64, device=row.device)
+    partner = partner.scatter_reduce(0, row[is_best], other[is_best], "amin")
+    return best, partner.masked_fill(partner == far, -1)
 
 
 def distinct_pairs(

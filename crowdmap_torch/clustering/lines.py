@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_sum
 
+_WITNESS_WEIGHT = 0.25
 MAX_ANGLE_COS = 0.94
 """Cosine of the largest angle (20 degrees) between the directions of lines that are one."""
 
@@ -31,6 +33,12 @@ class LineSamples:
     owner: Int[Tensor, " n"]
     """Source of the track, not decreasing."""
     weight: Float[Tensor, " n"]
+    """0 to 1: how far a sample is to be believed."""
+
+    @property
+    def is_witness(self) -> Bool[Tensor, " n"]:
+        """True for the samples that are believed enough to say that a line exists."""
+        return self.weight >= _WITNESS_WEIGHT
 
     def __len__(self) -> int:
         return len(self.track)
@@ -140,5 +148,6 @@ def scalar_key(key: Int[Tensor, "n k"]) -> Int[Tensor, " n"]:
     return result
 
 
-def dot(a: Float[Tensor, "n 2"], b: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
+def dot(a: Float[Tensor, "n _"], b: Float[Tensor, "n _"]) -> Float[Tensor, " n"]:
+    """Scalar products of the first two columns."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]

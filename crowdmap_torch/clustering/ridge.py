@@ -24,8 +24,8 @@ from crowdmap_torch.clustering.lines import (
     scalar_key,
 )
 
-_POINTS_AT_ONCE = 8192
-"""Points shifted in one go: their pairs with samples are what memory goes to."""
+_PAIRS_AT_ONCE = 500_000
+"""Pairs of points and samples, about, that are held at once: they are what memory goes to."""
 _SECTOR = torch.pi / 12
 """Grain of the directions of start points."""
 
@@ -105,7 +105,10 @@ def shift_to_ridges(
     tree = KDTree(_squeezed(samples.point, config, reach))
     place = _squeezed(points.point, config, reach)
     parts = []
-    for rows in torch.arange(len(points), device=points.point.device).split(_POINTS_AT_ONCE):
+    few = place[:: max(1, len(place) // 256)]
+    crowd = tree.query_ball_point(few, reach, return_length=True).mean()
+    at_once = max(1, int(_PAIRS_AT_ONCE / max(crowd, 1.0)))
+    for rows in torch.arange(len(points), device=points.point.device).split(at_once):
         pairs = _pairs(samples, tree, place[rows.cpu().numpy()], reach)
         parts.append(_shift(points[rows], samples, pairs, config, iterations))
     return RidgePoints(
@@ -202,7 +205,7 @@ def _supported(
     n = len(points)
     runs = int(pairs.owner_run[-1]) + 1 if len(pairs.i) else 0
     sees = torch.zeros(runs, dtype=torch.bool, device=near.device)
-    sees[pairs.owner_run[near]] = True
+    sees[pairs.owner_run[near & samples.is_witness[pairs.k]]] = True
     point_of_run = torch.zeros(runs, dtype=torch.int64, device=near.device)
     point_of_run[pairs.owner_run] = pairs.i
     kinds = points.votes.shape[1]

@@ -76,8 +76,8 @@ def eigengap(
 ) -> Int[Tensor, " *batch"]:
     """The number of clusters: where the ascending eigenvalues of a normalised Laplacian jump most.
 
-    Only the first `size` eigenvalues count. P perfect clusters have P zeros followed by ones, so a one is thought behind
-    the last eigenvalue: `size` clusters of one node each are an answer too.
+    Only the first `size` eigenvalues count. P perfect clusters have P zeros followed by ones, so a one is thought
+    behind the last eigenvalue: `size` clusters of one node each are an answer too.
     """
     after = torch.cat((eigenvalues[..., 1:], torch.ones_like(eigenvalues[..., :1])), dim=-1)
     rank = torch.arange(eigenvalues.shape[-1], device=eigenvalues.device)
@@ -91,8 +91,8 @@ def kmeans_labels(
 ) -> Int[Tensor, " n"]:
     """K-means on the rows of the first k eigenvectors, scaled to unit length (Ng, Jordan, Weiss 2001).
 
-    Rows of one cluster are parallel and rows of different clusters orthogonal in the ideal case, whatever the sign or the
-    rotation of the eigenvectors; the first run starts from rows chosen to be as orthogonal as can be.
+    Rows of one cluster are parallel and rows of different clusters orthogonal in the ideal case, whatever the sign or
+    the rotation of the eigenvectors; the first run starts from rows chosen to be as orthogonal as can be.
     """
     count = vectors.shape[1]
     if count == 1:
@@ -258,7 +258,7 @@ def _padded_laplacians(
     nodes = np.concatenate(members)
     batch = np.repeat(np.arange(len(members)), size.numpy())
     place = np.arange(len(nodes)) - np.repeat(np.cumsum(size.numpy()) - size.numpy(), size.numpy())
-    where = np.full(matrix.shape[0], -1, dtype=np.int64)
+    where = np.full(len(matrix.indptr) - 1, -1, dtype=np.int64)
     where[nodes] = np.arange(len(nodes))
     block = sparse.coo_matrix(matrix[nodes])
     i, j = block.row, where[block.col]

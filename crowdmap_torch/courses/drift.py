@@ -56,8 +56,8 @@ def journey_offsets(
     """Offsets at nodes along each journey, and the offset of every sample, matched or not.
 
     Each journey's offset is a chain of nodes under an Ornstein-Uhlenbeck prior, seen across the matched curves
-    (sideways and in height); samples that do not fit the rest of their journey lose their say, and a journey far off is not held
-    back.
+    (sideways and in height). Samples that do not fit the rest of their journey lose their say, and a journey far off is
+    not held back.
     """
     line = samples.line
     journeys, journey_of = torch.unique(line.owner, return_inverse=True)

@@ -14,6 +14,9 @@ from crowdmap_torch.courses.curves import Curves, Match
 
 _STRETCH = 10.0
 """Side by side means: both seen by one journey on the same ten metres."""
+_CROSSING_REACH = 2.0
+_CROSSED = 0.4
+"""How far a curve must be on both sides of another to cross it [m]."""
 _END = 3.0
 """How near to its end a curve ends [m]."""
 
@@ -71,6 +74,30 @@ def covered_twice(
     lost = lesser & (together < min_seen_together)
     dropped[i[lost[pair_of]]] = True
     return dropped
+
+
+def crosses_longer(curves: Curves, *, height_gate: float = 2.0) -> Bool[Tensor, " n"]:
+    """Curves that pass from one side of a curve twice as long to the other: paint does not, strayed pieces do."""
+    n = len(curves)
+    flat = curves.point[:, :2].detach().cpu().numpy()
+    found = KDTree(flat).query_pairs(_CROSSING_REACH, output_type="ndarray")
+    pair = torch.from_numpy(found.astype(np.int64)).to(curves.point.device)
+    i, j = torch.cat((pair, pair.flip(1))).T
+    a, b = curves.curve[i], curves.curve[j]
+    length = curves.length
+    delta = curves.point[i] - curves.point[j]
+    axis = curves.direction[j]
+    along = delta[:, 0] * axis[:, 0] + delta[:, 1] * axis[:, 1]
+    left = axis[:, 0] * delta[:, 1] - axis[:, 1] * delta[:, 0]
+    near = (a != b) & (2 * length[a] <= length[b]) & (delta[:, 2].abs() < height_gate)
+    near &= along.abs() < 0.75
+    pairs, pair_of = torch.unique((a * n + b)[near], return_inverse=True)
+    none = left.new_zeros(len(pairs))
+    most = none.scatter_reduce(0, pair_of, left[near], "amax")
+    least = none.scatter_reduce(0, pair_of, left[near], "amin")
+    result = torch.zeros(n, dtype=torch.bool, device=pair.device)
+    result[(pairs // n)[(most > _CROSSED) & (least < -_CROSSED)]] = True
+    return result
 
 
 def _support(curves: Curves, matched: Match, weight: Float[Tensor, " s"]) -> Float[Tensor, " k"]:

@@ -43,7 +43,7 @@ def supported_rows(
     curves: Curves, samples: LineSamples, matched: Match, min_owners: int
 ) -> Bool[Tensor, " k"]:
     """Points of curves from the first to the last place that at least `min_owners` owners saw."""
-    used = matched.curve >= 0
+    used = (matched.curve >= 0) & samples.is_witness
     bins = int((curves.station / _BIN).max()) + 2 if len(curves.station) else 1
     place = matched.curve[used] * bins + (matched.station[used] / _BIN).long().clamp(0, bins - 1)
     owners = int(samples.owner.max()) + 1 if len(samples) else 1

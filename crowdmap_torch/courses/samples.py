@@ -52,8 +52,11 @@ class LaneSamples:
         return replace(self, line=replace(self.line, point=self.line.point + offset))
 
 
-def sample_lanes(lanes: Lanes, spacing: float) -> LaneSamples:
-    """Samples of all pieces at most `spacing` [m] apart."""
+def sample_lanes(lanes: Lanes, spacing: float, *, few_observations: float) -> LaneSamples:
+    """Samples of all pieces at most `spacing` [m] apart.
+
+    A piece made from as few detections as `few_observations`, or a quarter of the median, weighs half.
+    """
     packed = lanes.select(torch.arange(len(lanes), device=lanes.journey.device))
     control, count = packed.control.point_world, packed.control_count
     piece, t = even_parameters(control, count, spacing)
@@ -72,7 +75,8 @@ def sample_lanes(lanes: Lanes, spacing: float) -> LaneSamples:
         kind=lanes.type[piece],
         track=track[piece],
         owner=lanes.journey[piece],
-        weight=_DRIFT_SIGMA**2 / (_DRIFT_SIGMA**2 + sigma.square()),
+        weight=_evidence(lanes, few_observations)[piece]
+        * (_DRIFT_SIGMA**2 / (_DRIFT_SIGMA**2 + sigma.square())),
     )
     order = track[piece].argsort(stable=True)
     return LaneSamples(
@@ -163,6 +167,15 @@ def places(
     tangent = (d_weight[:, None] @ near)[:, 0]
     run = tangent[:, :2].norm(dim=1).clamp_min(1e-9)
     return point, tangent[:, :2] / run[:, None], tangent[:, 2] / run
+
+
+def _evidence(lanes: Lanes, few: float) -> Float[Tensor, " n"]:
+    """How far pieces are to be believed, 0 to 1: false detections seldom make long tracklets."""
+    number = lanes.n_observations.to(lanes.confidence).clamp_min(1)
+    if not len(number):
+        return number
+    few_sq = (0.25 * number.median()).clamp_max(few).square()
+    return number.square() / (number.square() + few_sq)
 
 
 def _tracks(lanes: Lanes) -> Int[Tensor, " n"]:

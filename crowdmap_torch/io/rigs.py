@@ -43,6 +43,13 @@ def read_rig(folder: Path) -> Rig:
     )
 
 
+def read_camera(folder: Path) -> Camera:
+    """The camera of a rig whose road need not be calibrated yet; InputError for what breaks FORMAT.md."""
+    rig = read_yaml(folder / "rig.yaml")
+    rig.allow(("camera",), ("road", "mount"))
+    return _read_camera(rig.part("camera"))
+
+
 def _read_camera(section: Document) -> Camera:
     section.allow(("model", "width", "height", "fx", "fy", "cx", "cy", "distortion"))
     model = section.text("model")

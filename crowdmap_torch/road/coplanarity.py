@@ -1,17 +1,18 @@
-"""The paper's online adjustment of the road normal: the candidate that makes the road most nearly a plane (IV-C, eq:rne).
+"""The paper's online adjustment of the road normal: the one that makes the road most nearly a plane (IV-C, eq:rne).
 
-With the points `w = c_n + R_n v_i(n)` of the paper, v_i the fixed rays cut at the candidate plane, the scatter matrix of
-a segment needs the mean and the second moments of the v_i only: the fixed points never meet the poses one by one.
+With the points `w = c_n + R_n v_i(n)` of the paper, v_i the fixed rays cut at the candidate plane,
+the scatter matrix of a segment needs the mean and the second moments of the v_i only: the fixed
+points never meet the poses one by one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.func import grad, jvp
 
 from crowdmap_torch.geometry.plane import harmonic_mean_singular_value, smallest_singular_value
 from crowdmap_torch.road.level import Level
@@ -27,7 +28,8 @@ class CoplanarityConfig:
     """The online adjustment exactly as in the paper (IV-C, eq:rne)."""
 
     cost: str = "smallest_singular_value"
-    """Of a segment's scatter matrix; or `harmonic_mean` of the singular values, the cheaper surrogate."""
+    """Of a segment's scatter matrix; or `harmonic_mean` of the singular values, the cheaper
+    surrogate."""
     segment_m: float = 20.0
     """Length of the segments over which the road counts as planar."""
     segments: int = 10
@@ -39,7 +41,8 @@ class CoplanarityConfig:
     update_m: float = 30.0
     """The normal is estimated anew after so much travel."""
     points_right: tuple[float, ...] = (-0.5, -0.25, 0.0, 0.25, 0.5)
-    """Fixed points below the horizon: on the plane z = 1 of the calibrated road frame, to the right."""
+    """Fixed points below the horizon: on the plane z = 1 of the calibrated road frame, to the
+    right."""
     points_down: tuple[float, ...] = (0.1, 0.15, 0.225, 0.35)
     """Likewise, below the calibrated horizon."""
     iterations: int = 12
@@ -77,13 +80,17 @@ class NormalUpdates:
     alpha: Float[Tensor, " u"]
     beta: Float[Tensor, " u"]
     sigma: Float[Tensor, " u"]
-    """1-sigma of the normal's angle, from the curvature of the cost [rad]; infinite where the cost does not decide."""
+    """1-sigma of the normal's angle, from the curvature of the cost [rad]; infinite where the cost
+    does not decide."""
 
 
 def pick_nodes(
     level: Level, station: Float[Tensor, " f+1"], config: CoplanarityConfig
 ) -> PoseNodes:
-    """The first pose in each cell that frames newly enter; `station` holds that of the frame before them, too."""
+    """The first pose in each cell that frames newly enter.
+
+    `station` holds that of the frame before them, too.
+    """
     cell = (station * (config.poses / config.segment_m)).floor().long()
     enters = cell[1:] > cell[:-1]
     return PoseNodes(cell[1:][enters], level.R_world_road[enters], level.position[enters])
@@ -96,7 +103,7 @@ def coplanar_normals(
     height: float,
     config: CoplanarityConfig,
 ) -> NormalUpdates:
-    """The normals at frames whose stations are given, each from the segments completed before it (eq:rne)."""
+    """The normals at frames with given stations, each from the segments before it (eq:rne)."""
     last = (station / config.segment_m).floor().long()
     slot = torch.arange(config.segments, device=frame.device)
     segment = last[:, None] - 1 - slot
@@ -106,6 +113,9 @@ def coplanar_normals(
     complete = present.any(-1)
     enough = complete.sum(-1) >= config.min_segments
     frame, index, present = frame[enough], index[enough], present[enough]
+    if not len(frame):
+        none = nodes.position[:0, 0]
+        return NormalUpdates(frame, none, none, none)
     R = nodes.R_world_road[index]
     c = nodes.position[index]
     weight = present.to(c)
@@ -127,7 +137,8 @@ def coplanar_normals(
         off = seen - centre
         between = off[..., :, None] * off[..., None, :]
         S = (weight[..., None, None] * (between + spread)).sum(-3) * len(rays)
-        # Where there is no segment, three distinct values: those of a zero matrix have no derivative.
+        # Where there is no segment, three distinct values: those of a zero matrix have no
+        # derivative.
         there = present.any(-1)
         S = torch.where(there[..., None, None], S, torch.diag(S.new_tensor([1.0, 2.0, 3.0])))
         return torch.where(there, singular(S), 0.0).sum(-1)
@@ -137,7 +148,8 @@ def coplanar_normals(
     freedom = (present.sum((-1, -2)) - 4 * complete[enough].sum(-1)).clamp_min(1)
     eigenvalue, V = torch.linalg.eigh(H)
     inverse = V @ ((1 / eigenvalue.clamp_min(1e-12))[..., None] * V.mT)
-    variance = 2 * (cost / freedom)[:, None, None] * inverse
+    # Rounding can leave an exact plane a cost below zero.
+    variance = 2 * (cost.clamp_min(1e-12) / freedom)[:, None, None] * inverse
     sigma = variance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     sigma = torch.where(eigenvalue[:, 0] > 0, sigma, torch.inf)
     return NormalUpdates(frame, tilt[:, 0], tilt[:, 1], sigma)
@@ -152,26 +164,29 @@ def _rows(
     return row, (nodes.cell[row] == cell) & (cell >= 0)
 
 
-def _minimise(costs, start: Float[Tensor, "u 2"], iterations: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Minima of independent functions of two variables by damped Newton steps; values and Hessians there."""
+def _minimise(
+    costs: Callable[[Tensor], Tensor], start: Float[Tensor, "u 2"], iterations: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Minima of independent functions of two variables (damped Newton), values and Hessians there."""
 
-    def slope_and_curvature(x: Tensor) -> tuple[Tensor, Tensor]:
-        slope = grad(lambda y: costs(y).sum())
-        columns = []
-        for k in range(2):
-            direction = torch.zeros_like(x)
-            direction[:, k] = 1
-            g, column = jvp(slope, (x,), (direction,))
-            columns.append(column)
-        H = torch.stack(columns, dim=-1)
-        return g, 0.5 * (H + H.mT)
+    def slope_and_curvature(x: Tensor) -> tuple[Float[Tensor, "u 2"], Float[Tensor, "u 2 2"]]:
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            (slope,) = torch.autograd.grad(costs(x).sum(), x, create_graph=True)
+            # One function each: the Hessian of their sum falls into blocks.
+            rows = [
+                torch.autograd.grad(slope[:, k].sum(), x, retain_graph=True)[0] for k in range(2)
+            ]
+        H = torch.stack(rows, dim=-1)
+        return slope.detach(), 0.5 * (H + H.mT)
 
     x, value = start, costs(start)
     damping = torch.full_like(value, 1e-3)
     for _ in range(iterations):
         g, H = slope_and_curvature(x)
         eigenvalue, V = torch.linalg.eigh(H)
-        # Uphill curvature is walked down all the same; the damping is relative to the larger of the two.
+        # Uphill curvature is walked down all the same; the damping is relative to the larger of the
+        # two.
         bounded = eigenvalue.abs() + damping[:, None] * eigenvalue.abs().amax(-1, keepdim=True)
         step = -(V @ ((V.mT @ g[..., None])[..., 0] / bounded.clamp_min(1e-12))[..., None])[..., 0]
         step = step * (0.02 / step.norm(dim=-1, keepdim=True).clamp_min(0.02))
@@ -180,5 +195,4 @@ def _minimise(costs, start: Float[Tensor, "u 2"], iterations: int) -> tuple[Tens
         x = torch.where(better[:, None], x + step, x)
         value = torch.where(better, new, value)
         damping = torch.where(better, damping / 4, damping * 8).clamp(1e-9, 1e6)
-    _, H = slope_and_curvature(x)
-    return x, value, H
+    return x, value, slope_and_curvature(x)[1]

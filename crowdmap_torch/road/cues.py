@@ -37,11 +37,13 @@ class RoadCueConfig:
     rotation_sigma: float = 4e-4
     """White noise of the measured rotation from frame to frame."""
     parallel_sigma: float = 1.5e-3
-    """What is wrong with a frame's vanishing point besides the points' noise: markers are not quite parallel."""
+    """What is wrong with a frame's vanishing point besides the points' noise: markers are not quite
+    parallel."""
     chord_m: float = 20.0
     """Travel after which the slope of the way itself is looked at."""
     chord_sigma: float = 1.1e-2
-    """1-sigma of it, from the drift of positions over that way and that of rotations over much longer ways."""
+    """1-sigma of it, from the drift of positions over that way and that of rotations over much
+    longer ways."""
     width_m: float = 100.0
     """Travel after which the widths of neighbouring lanes are compared."""
     width_sigma: float = 0.025
@@ -77,13 +79,14 @@ def measure(
     travel: Travel,
     config: RoadCueConfig,
 ) -> tuple[Measurements, Travel]:
-    """The measurements of frames that follow on `travel`, and what the frames after them need to know."""
+    """The measurements of frames that follow on `travel`, and the `travel` for those after them."""
     frames = len(level)
     row = dt.new_zeros(frames, 5, STATE_SIZE)
     known = torch.zeros_like(row)
     value = dt.new_zeros(frames, 5)
     variance = torch.full_like(value, MISSING)
-    # The springs shake with a memory: over many frames it averages out more slowly than white noise.
+    # The springs shake with a memory: over many frames it averages out more slowly than white
+    # noise.
     longer = (2 * config.shaking_memory_s / dt.clamp_min(1e-3)).clamp_min(1)
     for k, (slope, stance, seen) in enumerate(
         ((SLOPE, STANCE, level.alpha), (CROSS, ROLL, level.beta))
@@ -146,9 +149,10 @@ def width_moments(
 ) -> Float[Tensor, "f 6"]:
     """Sums over neighbouring pairs of markers of 1, p, p^2, l, p l, and 1 for a frame that has any.
 
-    l is the logarithm of the pair's width and p the sum of its two offsets [camera heights]. A camera that rolls by beta against
-    its calibration sees `m + beta m^2` for an offset m, and so widths that grow by beta p from one side to the other. Where a roll
-    `beta` has been taken off already it is put back.
+    l is the logarithm of the pair's width and p the sum of its two offsets [camera heights]. A
+    camera that rolls by beta against its calibration sees `m + beta m^2` for an offset m, and so
+    widths that grow by beta p from one side to the other. Where a roll `beta` has been taken off
+    already it is put back.
     """
     frames = rays.frames
     # By frame, and from left to right within it.
@@ -170,7 +174,10 @@ def width_moments(
 def _roll_of_widths(
     moments: Float[Tensor, "n 6"], config: RoadCueConfig
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Slope of the regression of widths on places, and its variance: every lane is off by its own share, in all frames."""
+    """Slope of the regression of widths on places, and its variance.
+
+    Every lane is off by its own share, the same in all frames: only lanes count, not frames.
+    """
     number, p, pp, width, pw, frames = moments.unbind(-1)
     n = number.clamp_min(1)
     spread = pp / n - (p / n) ** 2

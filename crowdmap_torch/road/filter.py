@@ -1,16 +1,18 @@
 """The road's slopes and the car's stance on it, frame after frame: a Kalman filter, and the smoother behind it.
 
-The state is, for the direction ahead and for the one to the right, (slope of the road, its growth per metre, stance): six
-numbers. Slopes are as seen through the measured rotations, whose slow drift they carry. The *stance* is the pitch (roll) of
-the normal against calibration without the springs' shaking: load, and what changes slowly. With `level` for what poses would
-give on a level road, the normal is `level + slope`, and on the average it is the stance:
+The state is, for the direction ahead and for the one to the right, (slope of the road, its growth
+per metre, stance): six numbers. Slopes are as seen through the measured rotations, whose slow drift
+they carry. The *stance* is the pitch (roll) of the normal against calibration without the springs'
+shaking: load, and what changes slowly. With `level` for what poses would give on a level road, the
+normal is `level + slope`, and on the average it is the stance:
 
     level = stance - slope + shaking                        every frame
     cue   = slope + known factors times the growths         where markers are seen
     chord = slope averaged over the last metres             after every stretch of travel
     width = roll                                            after every longer stretch with lanes side by side
 
-What measurements need of frames is computed ahead in one batch (`cues.measure`); left to the loop are products of 6 x 6 matrices.
+What measurements need of frames is computed ahead in one batch (`cues.measure`); left to the loop
+are products of 6 x 6 matrices.
 """
 
 from __future__ import annotations
@@ -41,14 +43,16 @@ class RoadFilterConfig:
     rotation_drift: float = 4e-4
     """Random walk of the measured rotation over one metre of travel [rad]."""
     gate: float = 2.5
-    """A measurement further off than this, in standard deviations, counts as one with so much larger a sigma (Huber)."""
+    """A measurement further off than this, in standard deviations, counts as one with so much
+    larger a sigma (Huber)."""
 
 
 @dataclass(frozen=True)
 class Measurements:
     """What one frame after another says: `value = (row + known) . state + noise`, `s` of them in each frame.
 
-    Of the state's entries in `known` nothing is learned: their part of a measurement is only taken off.
+    Of the state's entries in `known` nothing is learned: their part of a measurement is only taken
+    off.
     """
 
     advance: Float[Tensor, " f"]
@@ -94,7 +98,10 @@ class Filtered:
 def filter_forward(
     start: RoadState, measurements: Measurements, config: RoadFilterConfig
 ) -> Filtered:
-    """The causal estimates of frames that follow on `start`; the last one is the `start` of the frames after them."""
+    """The causal estimates of frames that follow on `start`.
+
+    The last one is the `start` of the frames after them.
+    """
     F = _transitions(measurements)
     Q = _process_noise(measurements, config)
     x, P = start.mean, start.covariance

@@ -1,8 +1,9 @@
 """Slopes instead of angles: the road in the frame of the calibrated camera, and how level the camera says it is (IV-C).
 
-The *road frame* is the camera turned so that its y axis is the calibrated road normal: x right, y down, z ahead. A normal
-close to y is `(beta, 1, alpha)`: alpha is the pitch (positive: the nose is down), beta the roll against calibration. Were
-the road level, poses would give both; what is missing is the road's own slope ahead and to the right. Slopes are tangents.
+The *road frame* is the camera turned so that its y axis is the calibrated road normal: x right, y
+down, z ahead. A normal close to y is `(beta, 1, alpha)`: alpha is the pitch (positive: the nose is
+down), beta the roll against calibration. Were the road level, poses would give both; what is
+missing is the road's own slope ahead and to the right. Slopes are tangents.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class Level:
     beta: Float[Tensor, " f"]
     """Roll likewise."""
     advance: Float[Tensor, " f"]
-    """Way ahead since the frame before [m]; negative backwards, 0 in the first frame. Sums up to no more than noise at a stand."""
+    """Way ahead since the frame before [m]; negative backwards, 0 in the first frame. Sums up to no
+    more than noise at a stand."""
     turn: Float[Tensor, " f"]
     """Change of heading since the frame before, positive to the right [rad]."""
 
@@ -54,9 +56,7 @@ class Level:
 
 def level_of(journey: Journey) -> Level:
     """The level of every frame of a journey."""
-    return level_of_poses(
-        journey.T_world_camera, journey.t_ns, road_frame(journey.rig)
-    )
+    return level_of_poses(journey.T_world_camera, journey.t_ns, road_frame(journey.rig))
 
 
 def level_of_poses(

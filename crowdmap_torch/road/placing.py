@@ -12,7 +12,7 @@ from crowdmap_torch.geometry import camera as camera_module
 from crowdmap_torch.geometry.plane import ground_points
 from crowdmap_torch.road.level import Level, level_of, slopes_of_normal
 from crowdmap_torch.road.surface import DriveSurface, lay_surface, meet
-from crowdmap_torch.tables import Journey, Rows, RoadEstimate
+from crowdmap_torch.tables import Journey, RoadEstimate, Rows
 
 _SHIFT_WINDOW_M = 2.0
 """Way over which the white noise of positions is averaged."""
@@ -34,7 +34,7 @@ class PlacedPoints(Rows):
 
 
 def place_on_planes(journey: Journey, road: RoadEstimate) -> PlacedPoints:
-    """Points on the plane under the car in the frame that sees them: the paper's inverse perspective mapping (eq:ipm)."""
+    """Points on the plane under the car in the frame that sees them: the paper's mapping (eq:ipm)."""
     level = level_of(journey)
     frame = journey.lanes.frame[journey.lane_points.detection]
     ray = torch.nn.functional.pad(journey.lane_points.ideal, (0, 1), value=1.0)
@@ -51,10 +51,11 @@ def place_on_planes(journey: Journey, road: RoadEstimate) -> PlacedPoints:
 
 
 def place_on_surface(journey: Journey, road: RoadEstimate) -> PlacedPoints:
-    """Points on the surface that the car drove over, in the world as it was measured when the car saw them from nearest.
+    """Points on the surface that the car drove, as measured when the car saw them from nearest.
 
-    Unlike the paper, the road is no plane: its slopes ahead and to the right are those that the car met later. From the frame
-    that sees a point to the frame that sees it from nearest the way is reckoned, so the drift of positions between is not in it.
+    Unlike the paper, the road is no plane: its slopes ahead and to the right are those that the car
+    met later. From the frame that sees a point to the frame that sees it from nearest the way is
+    reckoned, so the drift of positions between is not in it.
     """
     level = level_of(journey)
     alpha, beta = slopes_of_normal(road.normal_camera, level.R_road_camera)
@@ -90,8 +91,9 @@ def lateral_sigma(
 ) -> Float[Tensor, " p"]:
     """1-sigma of points across the road [m]: their noise in the image, the normal's, and drift over the way to them.
 
-    A normal off by an angle moves a point by `depth / height` times its offset: far points are worth little. `normal_sigma` is what
-    differs from frame to frame [rad]; `drift` [m] over one metre of travel.
+    A normal off by an angle moves a point by `depth / height` times its offset: far points are
+    worth little. `normal_sigma` is what differs from frame to frame [rad]; `drift` [m] over one
+    metre of travel.
     """
     height = road.height[frame]
     depth = placed.depth.clamp_min(0.1)
@@ -104,14 +106,12 @@ def lateral_sigma(
 def _nearest_view(
     journey: Journey, level: Level, offset: Float[Tensor, " p"]
 ) -> Float[Tensor, " p"]:
-    """How far ahead a point of the road with a given offset is when it is about to leave the image [m]."""
+    """How far ahead a point with a given offset is when it is about to leave the image [m]."""
     like = level.position
     side = torch.arange(-16.0, 16.5, 1.0).to(like)
     ahead = torch.arange(1.0, 30.25, 0.25).to(like)
     down = torch.full_like(ahead, journey.rig.camera_height)
-    grid = torch.stack(
-        torch.broadcast_tensors(side[:, None], down[None], ahead[None]), dim=-1
-    )
+    grid = torch.stack(torch.broadcast_tensors(side[:, None], down[None], ahead[None]), dim=-1)
     visible = camera_module.project(journey.rig.camera, grid @ level.R_road_camera)[1]
     ever = visible.any(-1)
     first = torch.where(ever, ahead[visible.to(torch.uint8).argmax(-1)], ahead[-1])

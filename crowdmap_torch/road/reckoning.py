@@ -1,4 +1,4 @@
-"""Where the camera went by its heading and the way it made, without its drifting positions: dead reckoning, for a few metres."""
+"""Dead reckoning for a few metres: where the camera went by its heading and the way it made alone."""
 
 from __future__ import annotations
 
@@ -25,9 +25,11 @@ class Slip:
     """How the camera moves when the car heads somewhere."""
 
     angle: Float[Tensor, ""]
-    """From the road frame's axis ahead to the direction of travel on a straight road, positive to the left [rad]."""
+    """From the road frame's axis ahead to the direction of travel on a straight road, positive to
+    the left [rad]."""
     lever: Float[Tensor, ""]
-    """How far ahead of the axle that does not steer the camera is: in a bend it swings outward [m]."""
+    """How far ahead of the axle that does not steer the camera is: in a bend it swings outward
+    [m]."""
 
 
 def headings(level: Level) -> Float[Tensor, " f"]:
@@ -45,7 +47,7 @@ def direction(heading: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"]:
 def reckon(
     level: Level, slope: Float[Tensor, " f"], slip: Slip
 ) -> tuple[Float[Tensor, "f 2"], Float[Tensor, " f"]]:
-    """East and north of the camera, and the height of the road under it, from the first frame on."""
+    """East and north of the camera, and height of the road under it, from the first frame on."""
     heading = headings(level)
     flat = _flat(level, slope)
     moved = (flat[:, None] * direction(_middle(heading) + slip.angle)).cumsum(0)

@@ -1,8 +1,9 @@
 """The road's surface along a drive: ruled by level-to-the-car lines square to the way, and where rays meet it.
 
-The surface is laid by dead reckoning: how far the car moved, where it headed (measured rotations) and how the road sloped (the
-estimated normals). Positions drift by centimetres over the few metres between where a marker is seen and where the car passes it,
-rotations do so by far less. `DriveSurface.shift` leads from the reckoned to the measured world at every frame.
+The surface is laid by dead reckoning: how far the car moved, where it headed (measured rotations)
+and how the road sloped (the estimated normals). Positions drift by centimetres over the few metres
+between where a marker is seen and where the car passes it, rotations do so by far less.
+`DriveSurface.shift` leads from the reckoned to the measured world at every frame.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _STEPS = 5
 
 @dataclass(frozen=True)
 class DriveSurface:
-    """The surface in reckoned coordinates: the camera over it in each frame, and nodes between which it is interpolated."""
+    """The surface in reckoned coordinates: the camera over it in each frame, and nodes along it."""
 
     station: Float[Tensor, " f"]
     """Furthest way ahead since the first frame [m]."""
@@ -70,7 +71,7 @@ def lay_surface(
     beta: Float[Tensor, " f"],
     height: Float[Tensor, " f"],
 ) -> DriveSurface:
-    """The surface of a drive whose normals have these pitches and rolls, and whose camera has these heights above it."""
+    """The surface of a drive whose camera has these heights above it, its normal these tilts."""
     slope, cross = alpha - level.alpha, beta - level.beta
     slip = fit_slip(level, slope)
     across, up = reckon(level, slope, slip)
@@ -95,7 +96,10 @@ def meet(
     frame: Int[Tensor, " p"],
     depth: Float[Tensor, " p"],
 ) -> SurfacePoints:
-    """Where rays from the cameras of frames meet the surface; `depth` is a first guess in units of the rays' length."""
+    """Where rays from the cameras of frames meet the surface.
+
+    `depth` is a first guess in units of the rays' length.
+    """
     origin = surface.centre[frame]
     flat = ray_world[:, :2].norm(dim=-1)
     station = surface.station[frame] + depth * flat
@@ -120,7 +124,7 @@ def meet(
     along = gap[:, 0] * course.cos() + gap[:, 1] * course.sin()
     offset = gap[:, 0] * course.sin() - gap[:, 1] * course.cos()
     above = point[:, 2] - place[:, 2] - cross * offset
-    is_met = (above.abs() < 0.02) & (along.abs() < 0.5) & (station > start) & (falling > 1e-3)
+    is_met = (above.abs() < 0.02) & (along.abs() < 0.5) & (station > start)
     return SurfacePoints(station, offset, point, is_met)
 
 

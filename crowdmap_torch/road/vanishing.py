@@ -1,13 +1,14 @@
 """The pitch of the camera against the road, from the vanishing point of the lane markers of one frame.
 
-Markers run side by side: at a depth Z ahead all of them have moved sideways by the same amount. On a plane road this
-shows in the image as lines that meet at the horizon (straight), or as hyperbolas with a common part (bends): with
-`q = (y + alpha) / h` for 1 / Z,
+Markers run side by side: at a depth Z ahead all of them have moved sideways by the same amount. On
+a plane road this shows in the image as lines that meet at the horizon (straight), or as hyperbolas
+with a common part (bends): with `q = (y + alpha) / h` for 1 / Z,
 
     x = m_i (y + alpha) + psi + kappa / (2 q) + kappa' / (6 q^2),
 
-where m_i is the offset of marker i in camera heights and psi, kappa, kappa' are the heading, the bend and its change that all
-markers of the frame share. Two markers give the pitch alpha; none of the poses' errors is in it.
+where m_i is the offset of marker i in camera heights and psi, kappa, kappa' are the heading, the
+bend and its change that all markers of the frame share. Two markers give the pitch alpha; none of
+the poses' errors is in it.
 """
 
 from __future__ import annotations
@@ -37,9 +38,11 @@ class VanishingConfig:
     range_m: tuple[float, float] = (3.0, 35.0)
     """Nearest and farthest depth of the points that are used."""
     bend_sigma: float = 3e-4
-    """What the road bends up or down beyond what is known of it [1/m]; takes weight from far points."""
-    scales: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0, 1.0)
-    """Factors on the noise, one for each step of iterated least squares (Tukey): from coarse to fine."""
+    """What the road bends up or down beyond what is known of it [1/m]; takes weight from far
+    points."""
+    scales: tuple[float, ...] = (16.0, 6.0, 2.0, 1.0)
+    """Factors on the noise, one for each step of iterated least squares (Tukey): from coarse to
+    fine."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ class VanishingFit:
     by_curvature: Float[Tensor, " f"]
     """Change of alpha for a road that bends upward ahead, by its curvature [m]."""
     by_twist: Float[Tensor, " f"]
-    """Change of alpha for a road whose slope to the right grows ahead, by its growth per metre [m]."""
+    """Change of alpha for a road whose slope to the right grows ahead, by its growth per metre
+    [m]."""
     bend: Float[Tensor, " f"]
     """kappa, positive to the right [1/m]."""
     offset: Float[Tensor, " d"]
@@ -83,7 +87,7 @@ def fit_vanishing(
     sigma_ideal: float,
     config: VanishingConfig,
 ) -> VanishingFit:
-    """The pitch of each frame by robust Gauss-Newton from a first guess `alpha`; all frames at once."""
+    """The pitch of each frame by robust Gauss-Newton from a first guess `alpha`, all at once."""
     x, y, detection, frame = rays.x, rays.y, rays.detection, rays.frame[rays.detection]
     count = len(rays.frame)
     shared = torch.cat((alpha[:, None], alpha.new_zeros(len(alpha), _SHARED - 1)), dim=-1)
@@ -92,6 +96,8 @@ def fit_vanishing(
     offset = _first_offsets(rays, alpha)
     loss = Tukey()
     near, far = config.range_m
+    covariance = response = torch.zeros_like(shared[:, :, None])
+    own = torch.zeros_like(offset)
     for scale in config.scales:
         a, psi, kappa, rate = shared[frame].unbind(-1)
         m = offset[detection]
@@ -103,7 +109,8 @@ def fit_vanishing(
         variance = sigma_ideal**2 * (1 + by_y**2) + (by_y * config.bend_sigma * Z / 2) ** 2
         whitened = residual.square() / variance
         weight = loss.weight(whitened / scale**2) / variance * used
-        # Columns: alpha, psi, kappa, kappa'; then what a curved and a twisted road would add to alpha.
+        # Columns: alpha, psi, kappa, kappa'; then what a curved and a twisted road would add to
+        # alpha.
         J = torch.stack(
             (by_y, -torch.ones_like(Z), -Z / 2, -(Z**2) / 6, by_y * Z / 2, by_y * x * Z), dim=-1
         )
@@ -111,9 +118,9 @@ def fit_vanishing(
         A, B, C, shared_rhs, offset_rhs = _normal_equations(
             J, by_offset, residual, weight, detection, rays.frame, count, rays.frames
         )
-        C = C + _PRIOR_OFFSET
+        own = C + _PRIOR_OFFSET
         # Each marker's own offset is eliminated: what is left is 4 x 4 for each frame.
-        ratio = B / C[:, None]
+        ratio = B / own[:, None]
         S = A.index_add(0, rays.frame, -ratio[:, :, None] * B[:, None, :])
         rhs = shared_rhs.index_add(0, rays.frame, -ratio * offset_rhs[:, None])
         S_shared = S[:, :_SHARED, :_SHARED] + torch.diag(prior)
@@ -122,8 +129,8 @@ def fit_vanishing(
         step = (covariance @ pull[..., None])[..., 0]
         shared = shared + step
         back = (B[:, :_SHARED] * step[rays.frame]).sum(-1)
-        offset = offset + (offset_rhs - back) / C
-    response = (covariance @ S[:, :_SHARED, _SHARED:])[:, 0]
+        offset = offset + (offset_rhs - back) / own
+        response = (covariance @ S[:, :_SHARED, _SHARED:])[:, 0]
     return VanishingFit(
         alpha=shared[:, 0],
         variance=covariance[:, 0, 0],
@@ -131,7 +138,7 @@ def fit_vanishing(
         by_twist=response[:, 1],
         bend=shared[:, 2],
         offset=offset,
-        offset_weight=C,
+        offset_weight=own,
     )
 
 
@@ -159,7 +166,7 @@ def _normal_equations(
     count: int,
     frames: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blocks of J^T W J and -J^T W r: shared [f 6 6], mixed [d 6], own [d], and the right-hand sides."""
+    """Blocks of J^T W J, shared [f 6 6], mixed [d 6] and own [d], and the parts of -J^T W r."""
     J = torch.cat((J, by_offset[:, None], residual[:, None]), dim=-1)
     size = J.shape[-1]
     i, j = torch.triu_indices(size, size, device=J.device)

@@ -8,11 +8,12 @@ the result.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from crowdmap_torch import residuals
@@ -40,10 +41,13 @@ def build(
     associations: Sequence[Association],
     drifts: Sequence[Float[Tensor, "f 6"]],
     config: AdjustConfig,
+    *,
+    left_out: Collection[int] = (),
 ) -> Bundle:
     """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
 
-    `drifts` are tangents per frame, from the positioning module's pose to the start pose.
+    `drifts` are tangents per frame, from the positioning module's pose to the start pose. Journeys `left_out`, by number,
+    have no say.
     """
     offsets = frame_offsets(journeys)
     prior = torch.cat([journey.T_world_camera for journey in journeys])
@@ -51,6 +55,12 @@ def build(
     start = se3.retract(prior, drift)
     corners = corner_observations(journeys, associations, signs)
     points, matches = _lane_rows(journeys, roads, lanes, start, config)
+    trusted = torch.ones(len(prior), dtype=torch.bool, device=prior.device)
+    for number in left_out:
+        trusted[offsets[number] : offsets[number + 1]] = False
+    corners = corners[trusted[corners.frame]]
+    of_trusted = trusted[points.frame]
+    points, matches = points[of_trusted], matches[of_trusted]
 
     used = torch.zeros(len(prior), dtype=torch.bool, device=prior.device)
     used[corners.frame] = True
@@ -88,8 +98,23 @@ def build(
     }
     fixed = _pose_terms(journeys, prior[frame], nodes, config)
     fixed.update(_lane_prior(values["lane"], lanes, config))
+    tree = cKDTree(values["pose"][:, :3, 3].cpu().numpy()) if len(frame) else None
+    beside = torch.zeros(0, dtype=torch.long, device=frame.device)
+    if tree is not None:
+        _, nearest = tree.query(values["lane"].cpu().numpy())
+        beside = torch.as_tensor(nearest, dtype=torch.long, device=frame.device)
     return Bundle(
-        values, variables, fixed, corners, points, matches, lanes.control_count, frame, nodes, config
+        values,
+        variables,
+        fixed,
+        corners,
+        points,
+        matches,
+        lanes.control_count,
+        frame,
+        nodes,
+        beside,
+        config,
     )
 
 
@@ -237,7 +262,10 @@ def _drift_model(
 def _lane_prior(
     coefficient: Float[Tensor, "c 3"], lanes: Lanes, config: AdjustConfig
 ) -> dict[str, CostTerm]:
-    """The weak prior that holds control points along the marker, and where it is hardly seen."""
+    """What holds control points together where observations do not.
+
+    Not where they started: that would count the journeys' own positions twice.
+    """
     if not len(lanes):
         return {}
     spline, rank = spline_basis.rows(lanes.control_count)
@@ -249,16 +277,22 @@ def _lane_prior(
     forward = torch.nn.functional.normalize(along, dim=-1)
     left = torch.nn.functional.normalize(torch.linalg.cross(up, forward), dim=-1)
     axes = torch.stack((forward, left, torch.linalg.cross(forward, left)), dim=-1)
-    shift = config.lane_shift_sigma_m
-    weight = 1 / coefficient.new_tensor([config.lane_slide_sigma_m, shift, shift])
-    term = CostTerm(
+    place = CostTerm(
         residuals.lane_prior,
         (("lane", torch.arange(len(coefficient), device=coefficient.device)),),
         (coefficient.clone(), axes),
-        weight.expand(len(coefficient), 3).contiguous(),
+        coefficient.new_full((len(coefficient),), 1 / config.lane_place_sigma_m),
         jacobian=residuals.lane_prior_jacobian,
     )
-    return {"lane_prior": term}
+    first = torch.nonzero(spline[1:] == spline[:-1])[:, 0]
+    step = CostTerm(
+        residuals.lane_stretch,
+        (("lane", first), ("lane", first + 1)),
+        (coefficient[first + 1] - coefficient[first], axes[first]),
+        (1 / coefficient.new_tensor(config.lane_step_sigma_m)).expand(len(first), 3).contiguous(),
+        jacobian=residuals.lane_stretch_jacobian,
+    )
+    return {"lane_prior": place, "lane_stretch": step}
 
 
 @torch.no_grad()
@@ -300,7 +334,7 @@ def read_map(
     shared = torch.zeros(3, 3, dtype=control.dtype, device=control.device)
     if not covariance:
         return signs, lanes, shared
-    normal = bundle.backend().assemble(bundle.problem(), values)
+    normal = bundle.backend().assemble(bundle.problem(held=False), values)
     joint = normal.marginal_covariance()
     offset = normal.structure.where.offset
     xyz = torch.arange(3, device=control.device)

@@ -59,8 +59,8 @@ class AlignConfig:
 class JourneyBias:
     """What each journey's poses have wrong, measured place minus true place, up to what all journeys share.
 
-    At a place of a journey it is `translation + heading x (place - centroid) + drift(station)`. The station is the distance
-    driven; the drift is linear between nodes, which are equally spaced along each journey and constant outside.
+    At a place of a journey it is `translation + heading x (place - centroid) + drift(station)`. The station is the
+    distance driven; the drift is linear between nodes, which are equally spaced, and constant outside them.
     """
 
     translation: Float[Tensor, "j 3"]
@@ -165,9 +165,10 @@ def align_journeys(
 ) -> JourneyBias:
     """The bias of each journey that brings its signs to the clusters they are in (V-B).
 
-    `station` [m] is the distance driven to where each sign was closest; `start` the bias known so far; `bias_sigma` [m] its
-    prior, `journey_weight` and the `certainty` of each sign being in the right cluster 0 to 1. What all journeys share cannot be seen: the mean of the biases, weighted by their
-    priors, is zero. Unlike the paper, the bias drifts along the journey, turns with it, and outliers have no say.
+    `station` [m] is the distance driven to where each sign was closest; `start` the bias known so far; `bias_sigma` [m]
+    its prior; `journey_weight` and the `certainty` of each sign being in the right cluster are 0 to 1. What all
+    journeys share cannot be seen: the mean of the biases, weighted by their priors, is zero. Unlike the paper, the bias drifts
+    along the journey and turns with it, and outliers have no say.
     """
     journeys = len(start)
     if bias_sigma is None:
@@ -301,7 +302,7 @@ def _bias_given_places(
 def _drift_prior(
     bias: JourneyBias, config: AlignConfig
 ) -> tuple[Float[Tensor, "k 3 3"], Float[Tensor, "k 3 3"]]:
-    """Information of an Ornstein-Uhlenbeck chain at the nodes: diagonal blocks, and those between a node and the next."""
+    """Information of an Ornstein-Uhlenbeck chain: diagonal blocks, and those between a node and the next."""
     K = len(bias.node_drift)
     owner = torch.repeat_interleave(
         torch.arange(len(bias), device=bias.node_start.device), bias.node_count

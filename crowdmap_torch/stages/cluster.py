@@ -96,7 +96,7 @@ def cluster_signs(
 
     `shift_sigma` [m], east north up, is how uncertain the journeys' shifts still are (`joint` only; default 0.3 m).
     Unlike the paper, the graph holds the nearest neighbours of each sign only, and each of its connected components has
-    its own eigenvalue gap; with `joint`, also distance is in standard deviations and differences of appearance add to it.
+    its own eigenvalue gap; with `joint`, distance is in standard deviations and differences of appearance add to it.
     """
     if config.method == "paper2017":
         return _cluster_paper(signs, config, generator)
@@ -174,9 +174,9 @@ def sign_heads(
 ) -> Signs:
     """The sign that stands for each cluster, row c for label c; every label 0 .. count - 1 must occur.
 
-    `paper2017`: mean corners of the members. `joint`: a robust mean of the centres weighted by covariance (`shift_sigma`
-    [m] is added to each) and by `weight` (0 to 1), and of the corners about them. Both are refitted to a plane and the
-    shape that most members have; members of other shapes give their centre only.
+    `paper2017`: mean corners of the members. `joint`: a robust mean of the centres weighted by covariance
+    (`shift_sigma` [m] is added to each) and by `weight` (0 to 1), and of the corners about them. Both are refitted to a
+    plane and the shape that most members have; members of other shapes give their centre only.
     """
     members, label, given, count = _members(signs, label, weight)
     shape, kind = _majority(members, label, given if method == "joint" else None, count)
@@ -203,7 +203,7 @@ def rough_heads(
     weight: Float[Tensor, " n"] | None = None,
     shift_sigma: float = 0.15,
 ) -> Signs:
-    """As `sign_heads` with `joint`, an upright sign of median size instead of fitted corners: enough to match against."""
+    """As `sign_heads` with `joint`, but upright signs of median size, no corners fitted: enough to match against."""
     members, label, given, count = _members(signs, label, weight)
     shape, kind = _majority(members, label, given, count)
     center, covariance, _ = _robust_center(members, given, label, count, shift_sigma)

@@ -1,8 +1,8 @@
 """V-A.2 (sec:mj-cluster-lanes): the lane pieces of many journeys joined along the road into continuous markers.
 
 Unlike the paper, nothing is decided about whole pieces: samples of all pieces make up ridges, ridges are strung
-together, and a piece supports every marker that it runs along. The slow offsets of the journeys against the common courses
-are taken off before the ridges are traced a second time, sharper.
+together, and a piece supports every marker that it runs along. The slow offsets of the journeys against the common
+courses are taken off before the ridges are traced a second time, sharper.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from crowdmap_torch.courses.curves import (
     select_curves,
 )
 from crowdmap_torch.courses.drift import DriftConfig, LaneOffsets, journey_offsets
-from crowdmap_torch.courses.duplicates import covered_twice, nearest_row
+from crowdmap_torch.courses.duplicates import covered_twice, crosses_longer, nearest_row
 from crowdmap_torch.courses.grow import drawn_out, supported_rows
 from crowdmap_torch.courses.samples import LaneSamples, merged, sample_lanes, stray_samples
 from crowdmap_torch.courses.support import LaneSupport, lane_support, lanes_table
@@ -43,6 +43,9 @@ from crowdmap_torch.courses.trace import (
 from crowdmap_torch.geometry import spline
 from crowdmap_torch.tables import LANE_TYPES, Lanes
 
+_RING_GAP = 1.0
+"""A long curve whose ends are nearer to each other than this is a ring [m]."""
+
 
 @dataclass(frozen=True)
 class LaneJoinConfig:
@@ -50,6 +53,8 @@ class LaneJoinConfig:
 
     sample_spacing_m: float = 2.0
     """Pieces are sampled this densely."""
+    few_observations: float = 10.0
+    """Pieces made from fewer detections (or a quarter of the usual number, if that is less) are hardly believed."""
     bandwidths_m: tuple[float, ...] = (0.6, 0.2)
     """Sigma of the sideways kernel of each round; journeys' offsets are estimated between rounds."""
     gates_m: tuple[float, ...] = (1.2, 0.7)
@@ -115,7 +120,9 @@ def join_lanes(lanes: Lanes, config: LaneJoinConfig) -> JoinedLanes:
     Pieces must be roughly free of their journeys' biases already (a third of the distance between markers). Returned
     lanes run in the direction of travel, or either way where journeys run both ways.
     """
-    all_samples = sample_lanes(lanes, config.sample_spacing_m)
+    all_samples = sample_lanes(
+        lanes, config.sample_spacing_m, few_observations=config.few_observations
+    )
     if not len(all_samples):
         return _nothing(lanes, all_samples)
     stray = stray_samples(all_samples, beside=config.stray_m)
@@ -177,7 +184,7 @@ def join_lanes(lanes: Lanes, config: LaneJoinConfig) -> JoinedLanes:
 
 def lane_offsets(lanes: Lanes, reference: Lanes, config: LaneJoinConfig) -> LaneOffsets:
     """How far from reference lanes each journey sees the markers, along its way: what an alignment takes off."""
-    samples = sample_lanes(lanes, config.sample_spacing_m)
+    samples = sample_lanes(lanes, config.sample_spacing_m, few_observations=config.few_observations)
     packed = reference.select(torch.arange(len(reference), device=reference.type.device))
     curves = curves_of(packed.control.point_world, packed.control_count, packed.type)
     matched = match(samples.line, curves, gate=config.gates_m[0])
@@ -242,7 +249,7 @@ def _once(
 
 
 def _by_type(curves: Curves, samples: LineSamples, gate: float, config: LaneJoinConfig) -> Curves:
-    """The curves with their types, cut where the type changes; both sides of a cut end in the same point."""
+    """The curves with their types, cut where the type changes; both sides of a cut end in one point, as do rings."""
     matched = match(samples, curves, gate=gate)
     used = (matched.curve >= 0) & (samples.kind >= 0)
     row, kinds = nearest_row(curves, matched)[used], len(LANE_TYPES)
@@ -261,6 +268,9 @@ def _by_type(curves: Curves, samples: LineSamples, gate: float, config: LaneJoin
     pieces = _refit(samples, matched, pieces, config)
     first = spline.starts(pieces.count)
     last = first + pieces.count - 1
+    gap = (pieces.control[first] - pieces.control[last]).norm(dim=1)
+    ring = ((gap < _RING_GAP) & (pieces.length > 50 * _RING_GAP)).nonzero()
+    joints = torch.cat((joints, ring.expand(-1, 2)))
     control = pieces.control.clone()
     middle = 0.5 * (control[last[joints[:, 0]]] + control[first[joints[:, 1]]])
     control[last[joints[:, 0]]] = middle
@@ -272,7 +282,7 @@ def _supported(
     curves: Curves, samples: LineSamples, matched: Match, config: LaneJoinConfig
 ) -> Curves:
     """The curves that are long enough and seen by enough journeys, each over a fifth of it or 20 m."""
-    used = matched.curve >= 0
+    used = (matched.curve >= 0) & samples.is_witness
     owners = int(samples.owner.max()) + 1
     key, group = torch.unique(
         matched.curve[used] * owners + samples.owner[used], return_inverse=True
@@ -290,7 +300,11 @@ def _supported(
     number = torch.bincount(curves.curve, minlength=len(curves))
     around = group_sum(around, curves.curve, len(curves)) / number
     is_long = curves.length >= rules.short_m
-    enough = (journeys >= needed) & (is_long | (journeys >= rules.short_share * around))
+    share = rules.short_share + (rules.min_share - rules.short_share) * (
+        curves.length / rules.short_m
+    )
+    is_right = is_long | ((journeys >= share * around) & ~crosses_longer(curves))
+    enough = (journeys >= needed) & is_right
     return select_curves(curves, enough & (curves.length >= rules.min_length_m))
 
 

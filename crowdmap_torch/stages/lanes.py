@@ -1,13 +1,13 @@
 """IV-D: lane tracklets of one journey -> overlapping pieces of markers as natural cubic splines, and what was pruned.
 
-`paper2017` maps every point to the plane under the car in its frame, and fits a spline to the most recent points again and
-again. Unlike the paper, `surface` lays the points on the road as the car drove it, weighs them by how far away they were
-seen, and cuts a marker into pieces of equal length.
+`paper2017` maps every point to the plane under the car in its frame, and fits a spline to the most
+recent points again and again. Unlike the paper, `surface` lays the points on the road as the car
+drove it, weighs them by how far away they were seen, and cuts a marker into pieces of equal length.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Int
@@ -57,7 +57,8 @@ class LaneConfig:
     """How lane tracklets become splines (IV-D)."""
 
     method: str = "surface"
-    """`surface`: points on the road that the car drove; `paper2017`: points on one plane a frame, most recent points."""
+    """`surface`: points on the road that the car drove; `paper2017`: points on one plane a frame,
+    most recent points."""
     min_frames: int = 4
     """Tracklets with fewer detections are pruned."""
     min_length_m: float = 4.0
@@ -75,7 +76,8 @@ class LaneConfig:
     control_points: int = 6
     """Of a whole piece; shorter ones have fewer, at the same spacing."""
     max_gap_m: float = 15.0
-    """A marker without points over a longer way ends, and begins again behind it: dashes are bridged."""
+    """A marker without points over a longer way ends, and begins again behind it: dashes are
+    bridged."""
     noise_px: float = 1.0
     """1-sigma of lane points."""
     normal_sigma: float = 1.5e-3
@@ -129,7 +131,7 @@ class LaneReport:
 def reconstruct_lanes(
     journey: Journey, tracklets: Tracklets, road: RoadEstimate, config: LaneConfig
 ) -> tuple[Lanes, LaneReport]:
-    """The lane pieces that a journey's tracklets show (the paper's O2), and the report of what was pruned."""
+    """The lane pieces that a journey's tracklets show (the paper's O2), and what was pruned."""
     label = tracklets.label
     frames = torch.bincount(label[label >= 0], minlength=tracklets.count)
     reason = torch.where(frames < config.min_frames, FEW_FRAMES, NO_POINTS)
@@ -166,9 +168,7 @@ def _surface_fit(
         overlap=config.overlap,
         control_points=config.control_points,
     )
-    pieces = pieces.select(
-        torch.bincount(pieces.piece, minlength=len(pieces)) >= config.min_points
-    )
+    pieces = pieces.select(torch.bincount(pieces.piece, minlength=len(pieces)) >= config.min_points)
     sigma = lateral_sigma(
         placed,
         frame,
@@ -198,9 +198,7 @@ def _paper_fit(
         number=config.paper.recent_points,
         control_points=config.control_points,
     )
-    pieces = pieces.select(
-        torch.bincount(pieces.piece, minlength=len(pieces)) >= config.min_points
-    )
+    pieces = pieces.select(torch.bincount(pieces.piece, minlength=len(pieces)) >= config.min_points)
     sigma = torch.full_like(placed.depth, 0.2)
     fit = fit_pieces(
         pieces,
@@ -240,7 +238,7 @@ def _table(
 ) -> tuple[Lanes, LaneReport]:
     n = len(pieces)
     count = pieces.control_count
-    piece_of_control, rank = spline.rows(count)
+    piece_of_control, _ = spline.rows(count)
     offset = _offset_of_control(placed, pieces, piece_of_control)
     shared = config.sigma_m**2 + (config.height_sigma * offset).square()
     sigma = (fit.sigma.square() + shared).sqrt()
@@ -277,7 +275,9 @@ def _table(
         first_seen_ns=journey.t_ns[first],
         last_seen_ns=journey.t_ns[last],
         confidence=share * (1 - torch.exp(-observations / config.confident_frames)),
-        control=ControlPoints(fit.control, sigma)[_forward(journey, fit.control, count, first, last)],
+        control=ControlPoints(fit.control, sigma)[
+            _forward(journey, fit.control, count, first, last)
+        ],
     )
     miss = fit.miss[kept[pieces.piece] & (fit.weight > 0.1)]
     points = int(kept[pieces.piece].sum())
@@ -309,16 +309,14 @@ def _forward(
 def _offset_of_control(
     placed: PlacedPoints, pieces: LanePieces, piece_of_control: Int[Tensor, " c"]
 ) -> Float[Tensor, " c"]:
-    """How far beside the car's way the points of each control point's piece are, in the mean [m]."""
+    """Mean distance of the points of each control point's piece from the car's way [m]."""
     n = len(pieces)
     offset = placed.offset[pieces.point].abs()
     total = offset.new_zeros(n).index_add(0, pieces.piece, offset)
     return (total / torch.bincount(pieces.piece, minlength=n).clamp_min(1))[piece_of_control]
 
 
-def _voted(
-    kind: Int[Tensor, " v"], piece: Int[Tensor, " v"], n: int
-) -> Int[Tensor, " n"]:
+def _voted(kind: Int[Tensor, " v"], piece: Int[Tensor, " v"], n: int) -> Int[Tensor, " n"]:
     """The type that most of a piece's detections have; -1 where none has one."""
     kinds, known = len(LANE_TYPES), kind >= 0
     votes = torch.bincount(piece[known] * kinds + kind[known], minlength=n * kinds)

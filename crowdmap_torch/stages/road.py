@@ -1,9 +1,11 @@
 """IV-C: the road normal in the camera frame, frame by frame, from poses and lane markers.
 
-`paper2017` is the paper's online adjustment: the normal that makes segments of the road planar (eq:rne). It knows the road by
-the car's movement alone, and positions that drift by centimetres a metre leave it a third of a degree unsure. Unlike the
-paper, `causal` and `smoothed` also see the vanishing point of the lane markers, the slope of the way, the widths of neighbouring
-lanes and the calibration, each with its own uncertainty, and follow the shaking of the springs in the measured rotations.
+`paper2017` is the paper's online adjustment: the normal that makes segments of the road planar
+(eq:rne). It knows the road by the car's movement alone, and positions that drift by centimetres a
+metre leave it a third of a degree unsure. Unlike the paper, `causal` and `smoothed` also see the
+vanishing point of the lane markers, the slope of the way, the widths of neighbouring lanes and the
+calibration, each with its own uncertainty, and follow the shaking of the springs in the measured
+rotations.
 """
 
 from __future__ import annotations
@@ -59,7 +61,8 @@ class RoadConfig:
     max_adjustment_deg: float = 3.0
     """Normals further from calibration than this are not admitted."""
     refinements: int = 1
-    """How often the markers are looked at again on the curved road found so far; method `smoothed`."""
+    """How often the markers are looked at again on the curved road found so far; method
+    `smoothed`."""
     coplanarity: CoplanarityConfig = field(default_factory=CoplanarityConfig)
     """Method `paper2017`."""
     cues: RoadCueConfig = field(default_factory=RoadCueConfig)
@@ -91,7 +94,8 @@ def estimate_road(journey: Journey, config: RoadConfig) -> RoadEstimate:
         surface = lay_surface(level, alpha, beta, height)
         flat = flattened_rays(surface, level, rays, alpha, beta, height)
         fit = _fit(flat, alpha, journey.rig, config)
-        # The flattened image has no bends, nor the roll and growth assumed: deviations from them are what it still shows.
+        # The flattened image has no bends, nor the roll and growth assumed: deviations from them
+        # are what it still shows.
         known = fit.by_curvature * state.mean[:, GROWTH]
         fit = replace(
             fit,
@@ -124,7 +128,10 @@ class RoadTracker:
         R_road_camera = road_frame(self._rig)
         T, t_ns = part.T_world_camera, part.t_ns
         if memory is not None:
-            T, t_ns = torch.cat((memory.T_world_camera[None], T)), torch.cat((memory.t_ns[None], t_ns))
+            T, t_ns = (
+                torch.cat((memory.T_world_camera[None], T)),
+                torch.cat((memory.t_ns[None], t_ns)),
+            )
         level = level_of_poses(T, t_ns, R_road_camera)
         dt = torch.diff(level.t_s, prepend=level.t_s[:1])
         if memory is None:
@@ -160,9 +167,7 @@ class RoadTracker:
         )
         update = (station / c.update_m).floor()
         frame = (update[1:] > update[:-1]).nonzero()[:, 0]
-        updates = coplanar_normals(
-            nodes, frame, station[1:][frame], self._rig.camera_height, c
-        )
+        updates = coplanar_normals(nodes, frame, station[1:][frame], self._rig.camera_height, c)
         tilt = _latest_admitted(updates, memory.tilt, len(level), self._config)
         kept = nodes[nodes.cell >= nodes.cell[-1:] - (c.segments + 2) * c.poses]
         travel = replace(memory.travel, station=station[-1])
@@ -209,9 +214,7 @@ def _rays(journey: Journey, level: Level) -> LaneRays:
     )
 
 
-def _fit(
-    rays: LaneRays, alpha: Float[Tensor, " f"], rig: Rig, config: RoadConfig
-) -> VanishingFit:
+def _fit(rays: LaneRays, alpha: Float[Tensor, " f"], rig: Rig, config: RoadConfig) -> VanishingFit:
     focal = (rig.camera.K[0, 0] * rig.camera.K[1, 1]).sqrt().item()
     vanishing = config.cues.vanishing
     return fit_vanishing(rays, alpha, rig.camera_height, vanishing.noise_px / focal, vanishing)
@@ -263,7 +266,7 @@ def _is_admitted(alpha: Tensor, beta: Tensor, config: RoadConfig) -> Tensor:
 def _latest_admitted(
     updates: NormalUpdates, before: Float[Tensor, " 3"], frames: int, config: RoadConfig
 ) -> Float[Tensor, "f 3"]:
-    """Pitch, roll and sigma in force in each frame: of the last update that was close enough to calibration."""
+    """Pitch, roll and sigma of the last update before each frame that was admitted."""
     good = _is_admitted(updates.alpha, updates.beta, config) & updates.sigma.isfinite()
     tilt = torch.stack((updates.alpha, updates.beta, updates.sigma), dim=-1)[good]
     tilt = torch.cat((before[None], tilt))

@@ -54,12 +54,10 @@ class RejoinConfig:
     """As are signs whose normals have a smaller scalar product."""
     drift_m: float = 0.029
     """Drift of positions over one metre of travel; it grows with the square root of the way."""
-    drift_limit_m: float = 0.35
-    """Drift of positions over any way."""
     speed: float = 12.0
     """Turns the time between two tracklets into a way [m/s]."""
-    pass_gap_s: float = 5.0
-    """Views of a sign after a longer silence are another pass, with a drift of its own."""
+    max_gap_s: float = 20.0
+    """Tracklets with a longer silence between them are two passes of a sign, and poses do not come back the same."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +123,7 @@ def triangulate_signs(
     if not len(rows):
         return _no_signs(journey), SignReport(reason, tracklets, _per_detection(journey))
     label, sign = tracklets.label[rows].unique(return_inverse=True)
-    views = _views(journey, tracklets, rows, sign, config)
+    views = _views(journey, tracklets, rows, sign)
     fit, scale = _fit(views, shape[label], config)
 
     group = _rejoin(views, fit, shape[label], config)
@@ -134,7 +132,7 @@ def triangulate_signs(
         reason[label[joined]] = REJOINED
         tracklets = replace(tracklets, label=_relabelled(tracklets, label, group))
         label, new_row = label[~joined], (~joined).cumsum(0) - 1
-        views = _parted(replace(views, sign=new_row[group][views.sign]), config)
+        views = replace(views, sign=new_row[group][views.sign])
         again = torch.isin(views.sign, new_row[group[joined]])
         fit, scale = _refit(views, again, shape[label], fit, scale, ~joined, config)
 
@@ -169,7 +167,6 @@ def _views(
     tracklets: Tracklets,
     rows: Int[Tensor, " m"],
     sign: Int[Tensor, " m"],
-    config: SignTriangulationConfig,
 ) -> SignViews:
     detections = journey.signs[rows]
     count = polygon.corner_count(detections.shape)
@@ -178,9 +175,8 @@ def _views(
     px = polygon.roll(detections.corners_px, shift, count)
     ideal = polygon.roll(detections.corners_ideal, shift, count)
     since_start = journey.t_ns - journey.t_ns[:1]
-    views = SignViews(
+    return SignViews(
         sign=sign,
-        part=sign,
         frame=detections.frame,
         t_s=since_start[detections.frame].to(px) * 1e-9,
         corners_px=px,
@@ -188,19 +184,6 @@ def _views(
         observation=camera.observation_matrix(journey.rig.camera, px, ideal),
         T_world_camera=journey.T_world_camera[detections.frame],
     )
-    return _parted(views, config)
-
-
-def _parted(views: SignViews, config: SignTriangulationConfig) -> SignViews:
-    """The views with every sign's passes told apart by long silences."""
-    order = torch.argsort(views.frame, stable=True)
-    order = order[torch.argsort(views.sign[order], stable=True)]
-    sign, t = views.sign[order], views.t_s[order]
-    begins = torch.zeros_like(sign, dtype=torch.bool)
-    begins[1:] = (sign[1:] != sign[:-1]) | (t[1:] - t[:-1] > config.rejoin.pass_gap_s)
-    part = torch.empty_like(views.part)
-    part[order] = begins.long().cumsum(0)
-    return replace(views, part=part)
 
 
 def _fit(
@@ -213,13 +196,9 @@ def _fit(
     yaws = tuple(math.radians(yaw) for yaw in config.start_yaw_deg)
     begin = starts(views, shape, centre, yaws=yaws, size_limits=config.size_m)
     k = len(begin)
-    parts = int(views.part.max()) + 1
     coarse = fit_signs_coarsely(
         concatenate(
-            [
-                replace(views, sign=views.sign + i * n, part=views.part + i * parts)
-                for i in range(k)
-            ]
+            [replace(views, sign=views.sign + i * n) for i in range(k)]
         ),
         shape.repeat(k),
         SignStart(torch.cat([s.T_world_sign for s in begin]), torch.cat([s.size for s in begin])),
@@ -247,8 +226,7 @@ def _refit(
 ) -> tuple[SignFit, Float[Tensor, " n"]]:
     """The fit of the signs `kept`, those of the views `again` anew."""
     sign, compact = views.sign[again].unique(return_inverse=True)
-    some = _parted(replace(views[again], sign=compact), config)
-    new, new_scale = _fit(some, shape[sign], config)
+    new, new_scale = _fit(replace(views[again], sign=compact), shape[sign], config)
 
     def merged(old: Tensor, part: Tensor) -> Tensor:
         return old[kept].index_put((sign,), part)
@@ -275,7 +253,7 @@ def _rejoin(
     begin = torch.full_like(fit.cost, torch.inf).scatter_reduce(0, views.sign, views.t_s, "amin")
     end = torch.full_like(fit.cost, -torch.inf).scatter_reduce(0, views.sign, views.t_s, "amax")
     gap_s = torch.maximum(begin[a] - end[b], begin[b] - end[a]).clamp_min(0)
-    drift = (rules.drift_m * (gap_s * rules.speed + 1).sqrt()).clamp_max(rules.drift_limit_m)
+    drift = rules.drift_m * (gap_s * rules.speed + 1).sqrt()
     eye = torch.eye(3, dtype=drift.dtype, device=drift.device)
     covariance = fit.covariance[a] + fit.covariance[b] + drift.square()[:, None, None] * eye
     offset = (centre[a] - centre[b])[..., None]
@@ -287,6 +265,7 @@ def _rejoin(
     ratio = torch.maximum(fit.size[a] / fit.size[b], fit.size[b] / fit.size[a]).amax(-1)
     agrees = (
         (distance_sq < rules.max_distance**2)
+        & (gap_s < rules.max_gap_s)
         & (shape[a] == shape[b])
         & (facing > rules.min_facing)
         & (ratio < rules.max_size_ratio * slack)

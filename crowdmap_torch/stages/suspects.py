@@ -21,7 +21,7 @@ class SuspectConfig:
     spread: float = 6.0
     """Figures further from the crowd's median than this many robust standard deviations are suspicious."""
     min_matched: float = 0.5
-    """Least share of a journey's signs that others saw too, of those they passed by, relative to the median journey's."""
+    """Least share of a journey's signs that others saw too where they passed, relative to the median journey's."""
     min_bias_m: float = 4.0
     """Biases below this are never suspicious [m]."""
     min_scatter_m: float = 0.7

@@ -70,7 +70,7 @@ def vote_biases(
     """First translation biases of `journeys` journeys from the pattern of the signs around.
 
     Every pair of similar signs of two journeys votes for the shift between the two; signs one post apart vote for wrong
-    shifts, but only the right one is the same at every post. The biases are the robust least-squares solution of all shifts.
+    shifts, but only the right one is the same at every post. The biases are the robust solution of all shifts.
     """
     device = signs.size.device
     pair = _partners(signs, config, journeys, generator)

@@ -111,10 +111,10 @@ def test_thinning_leaves_one_point_a_metre() -> None:
 def test_merging_keeps_the_line_of_a_track() -> None:
     samples = straight([0.0, 3.5])
     twice = samples[torch.arange(len(samples)).repeat_interleave(2)]
-    merged, went = merged(twice, 2.0)
-    assert len(merged) < len(samples)
-    assert (merged.track[went] == twice.track).all()
-    across = merged.point[:, 1] - 3.5 * merged.track
+    fewer, went = merged(twice, 2.0)
+    assert len(fewer) < len(samples)
+    assert (fewer.track[went] == twice.track).all()
+    across = fewer.point[:, 1] - 3.5 * fewer.track
     assert float(across.abs().max()) < 1e-12
 
 

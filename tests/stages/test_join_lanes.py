@@ -215,12 +215,12 @@ def test_lanes_move_with_the_world(world: lane_world.LaneWorld, joined: JoinedLa
     again = sampled(join_lanes(turned, CONFIG).lanes)
     back = (again - shift) @ R
     tree = KDTree(
-        spline.sample_flat(joined.lanes.control.point_world, joined.lanes.control_count, 0.05)[
+        spline.sample_flat(joined.lanes.control.point_world, joined.lanes.control_count, 0.1)[
             0
         ].numpy()
     )
     # The grid that start points come from is another one: curves agree to centimetres, not to rounding.
-    assert np.quantile(tree.query(back)[0], 0.98) < 0.04
+    assert np.quantile(tree.query(back)[0], 0.98) < 0.06
 
 
 def test_roads_above_each_other_are_not_joined() -> None:
