@@ -1,4 +1,4 @@
-"""The unknowns of bundle adjustment, the observations of them, and the least-squares problem that they make (V-B, eq:ba)."""
+"""The unknowns of bundle adjustment, the observations of them, and the problem that they make (V-B, eq:ba)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ class AdjustConfig:
     """Bundle adjustment (V-B)."""
 
     lm: lm.LmConfig = field(
-        default_factory=lambda: lm.LmConfig(max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9)
+        default_factory=lambda: lm.LmConfig(
+            max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9
+        )
     )
     """The solver; its tolerance counts once the scales stand still."""
     prior: PosePriorConfig = field(default_factory=PosePriorConfig)
@@ -96,9 +98,12 @@ class Bundle(nn.Module):
     """The unknowns of bundle adjustment and all observations of them.
 
     Every unknown is a base value on its manifold (a buffer) and a tangent increment (an `nn.Parameter`) that is zero at
-    rest: `state_dict()` is the checkpoint, `.to(device)` moves everything, and an optimiser that steps the increments stays on
-    the manifold.
+    rest: `state_dict()` is the checkpoint, `.to(device)` moves everything, and an optimiser that steps the increments
+    stays on the manifold.
     """
+
+    scale: Tensor
+    """Standard deviation of sign corners and lane points [px], as the residuals show it."""
 
     def __init__(
         self,
@@ -155,16 +160,14 @@ class Bundle(nn.Module):
 
     def backend(self) -> ChainBackend:
         """The solver's back end: frames hang on the drift's chains, and both are eliminated."""
-        return ChainBackend(
-            "drift", self.nodes.journey, leaves="pose", carrier=self.nodes.of_frame
-        )
+        return ChainBackend("drift", self.nodes.journey, leaves="pose", carrier=self.nodes.of_frame)
 
     @torch.no_grad()
     def refresh(self) -> bool:
         """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
 
-        The scales start at what the residuals show, so that a wrong start does not make outliers of everything, and fall
-        as the fit improves; they never grow again.
+        The scales start at what the residuals show, so that a wrong start does not make outliers of everything, and
+        fall as the fit improves; they never grow again.
         """
         values = self.values()
         if len(self.lane_points):

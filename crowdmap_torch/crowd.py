@@ -10,7 +10,13 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs
 from crowdmap_torch.clustering.spectral import renumber, same_partition
-from crowdmap_torch.crowd_signs import CrowdSigns
+from crowdmap_torch.crowd_signs import (
+    CrowdSigns,
+    enough_to_tell,
+    miss_sigma,
+    unexplained_covariance,
+    with_covariance,
+)
 from crowdmap_torch.stages.align import (
     AlignConfig,
     JourneyBias,
@@ -69,6 +75,10 @@ class CrowdConfig:
     """
     rounds: int = 4
     """Most alternations of clustering and alignment for each of these (`paper2017`: in all)."""
+    seed_journeys: int = 60
+    """`joint`: most journeys that clusters are first made from in one place; the others' signs are matched to those."""
+    seed_cell_m: float = 50.0
+    """Size of a place [m]."""
     stands_still: float = 0.001
     """`joint`: clusters stand still when at most this share of the signs changes."""
     min_journeys: int = 2
@@ -153,31 +163,6 @@ def unbiased_signs(crowd: CrowdSigns, bias: JourneyBias) -> Signs:
     return moved(signs, -bias_at(bias, signs.journey, crowd.station, signs.center_world))
 
 
-def with_covariance(signs: Signs, extra: Float[Tensor, "n 3 3"]) -> Signs:
-    """The same signs, `extra` [m^2] less certain."""
-    return replace(signs, covariance=signs.covariance + extra)
-
-
-def unexplained_covariance(crowd: CrowdSigns, sigma: Float[Tensor, " 3"]) -> Float[Tensor, "n 3 3"]:
-    """What is missing from the covariance of each sign for 1-sigmas of `sigma` [m] along its viewing axes."""
-    axes = crowd.viewing_axes
-    own = (axes.mT @ crowd.signs.covariance @ axes).diagonal(dim1=1, dim2=2)
-    missing = (sigma.square() - own).clamp_min(0)
-    return axes @ torch.diag_embed(missing) @ axes.mT
-
-
-def miss_sigma(
-    crowd: CrowdSigns, unbiased: Signs, label: Int[Tensor, " n"], heads: Signs
-) -> Float[Tensor, " 3"]:
-    """Robust 1-sigma of what signs miss their clusters by along their viewing axes [m]; zero if there are none."""
-    used = label >= 0
-    miss = unbiased.center_world[used] - heads.center_world[label[used]]
-    if not len(miss):
-        return miss.new_zeros(3)
-    along = (crowd.viewing_axes[used].mT @ miss[..., None])[..., 0]
-    return 1.4826 * along.abs().median(0).values
-
-
 def _associate_paper(crowd: CrowdSigns, config: CrowdConfig, generator: torch.Generator) -> Crowd:
     signs = crowd.signs
     cluster = replace(config.cluster, method="paper2017")
@@ -257,7 +242,7 @@ def _associate_joint(crowd: CrowdSigns, config: CrowdConfig, generator: torch.Ge
         weight[[s.journey for s in suspects]] = 0
     assert statistics is not None
     least_journeys = min(config.min_journeys, journeys)
-    if least_journeys < 2:
+    if least_journeys < 2 and len(label):
         rest = label < 0
         label = torch.where(rest, int(label.max()) + rest.cumsum(0), label)
     label = without_small(
@@ -286,6 +271,10 @@ def _regroup(
     """
     sigma = signs.size.new_full((3,), shift_sigma)
     rest = torch.nonzero(label < 0)[:, 0]
+    few = enough_to_tell(
+        signs[rest], most=config.seed_journeys, cell_m=config.seed_cell_m, generator=generator
+    )
+    rest = rest[few]
     found = cluster_signs(signs[rest], config.cluster, generator=generator, shift_sigma=sigma)
     fresh = torch.full_like(label, -1)
     fresh[rest] = found.label

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, pairs_within
@@ -153,3 +153,49 @@ def _largest_leap(journey: Journey) -> Float[Tensor, ""]:
     seconds = journey.t_ns.diff().to(step) * 1e-9
     beyond = (step - _FASTEST_MPS * seconds).clamp_min(0)
     return torch.cat((beyond, beyond.new_zeros(1))).max()
+
+
+def with_covariance(signs: Signs, extra: Float[Tensor, "n 3 3"]) -> Signs:
+    """The same signs, `extra` [m^2] less certain."""
+    return replace(signs, covariance=signs.covariance + extra)
+
+
+def unexplained_covariance(crowd: CrowdSigns, sigma: Float[Tensor, " 3"]) -> Float[Tensor, "n 3 3"]:
+    """What is missing from the covariance of each sign for 1-sigmas of `sigma` [m] along its viewing axes."""
+    axes = crowd.viewing_axes
+    own = (axes.mT @ crowd.signs.covariance @ axes).diagonal(dim1=1, dim2=2)
+    missing = (sigma.square() - own).clamp_min(0)
+    return axes @ torch.diag_embed(missing) @ axes.mT
+
+
+def miss_sigma(
+    crowd: CrowdSigns, unbiased: Signs, label: Int[Tensor, " n"], heads: Signs
+) -> Float[Tensor, " 3"]:
+    """Robust 1-sigma of what signs miss their clusters by along their viewing axes [m]; zero if there are none."""
+    used = label >= 0
+    miss = unbiased.center_world[used] - heads.center_world[label[used]]
+    if not len(miss):
+        return miss.new_zeros(3)
+    along = (crowd.viewing_axes[used].mT @ miss[..., None])[..., 0]
+    return 1.4826 * along.abs().median(0).values
+
+
+def enough_to_tell(
+    signs: Signs, *, most: int, cell_m: float, generator: torch.Generator
+) -> Bool[Tensor, " n"]:
+    """True for the signs of at most `most` journeys in each cell of `cell_m` [m], chosen at random."""
+    if not len(signs):
+        return torch.zeros(0, dtype=torch.bool, device=signs.journey.device)
+    cell = (signs.center_world[:, :2] / cell_m).floor().long()
+    cell = cell - cell.amin(0)
+    place = cell[:, 0] * (int(cell[:, 1].max()) + 1) + cell[:, 1]
+    span = int(signs.journey.max()) + 1
+    visits, visit = torch.unique(place * span + signs.journey, return_inverse=True)
+    order = torch.rand(len(visits), generator=generator, dtype=torch.float64).argsort()
+    order = order.to(visits.device)
+    order = order[(visits[order] // span).argsort(stable=True)]
+    _, size = torch.unique_consecutive(visits[order] // span, return_counts=True)
+    rank = torch.empty_like(order)
+    start = torch.repeat_interleave(size.cumsum(0) - size, size)
+    rank[order] = torch.arange(len(order), device=order.device) - start
+    return rank[visit] < most

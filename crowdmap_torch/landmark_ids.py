@@ -1,4 +1,4 @@
-"""Names of landmarks: taken from the first detection of each, so that a landmark keeps its name when journeys are added."""
+"""Names of landmarks, from the first detection of each: a landmark keeps its name when journeys are added."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from crowdmap_torch.geometry import plane, spline_basis
@@ -16,6 +16,8 @@ from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Rows
 
 _STEPS = 4
 """Gauss-Newton steps along the projected spline; it is nearly straight at a lane point's scale."""
+_SLACK = 0.05
+"""Knots beyond a spline's end at which a match is lost, and within it at which a lost one is taken up again."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class LaneMatches(Rows):
     normal_px: Float[Tensor, "m 2"]
     """Image normal of the projected spline there."""
     valid: Bool[Tensor, " m"]
-    """False where the closest point is beyond the spline's end or behind the camera."""
+    """False where the closest point is beyond the spline's end or behind the camera; `follow` looks at what was."""
 
 
 def nearest_lanes(
@@ -43,7 +45,7 @@ def nearest_lanes(
     samples = spline_basis.evaluate_flat(lanes.control.point_world, count, t, piece)
     # Heights of a first guess are off by more than markers are apart; a bridge is not.
     squash = samples.new_tensor([1.0, 1.0, 0.3])
-    tree = cKDTree((samples * squash).cpu().numpy())
+    tree = KDTree((samples * squash).cpu().numpy())
     distance, index = tree.query((point_world * squash).cpu().numpy(), distance_upper_bound=gate)
     found = torch.as_tensor(distance, device=t.device) < gate
     index = torch.as_tensor(index, device=t.device).clamp_max(len(samples) - 1)
@@ -81,22 +83,36 @@ def follow(
     M = observations.matrix @ T_world_camera[:, :3, :3].mT
     position = T_world_camera[:, :3, 3]
     last = (own - 1).to(t)
-    for step in range(_STEPS + 1):
-        rows, weight, d_weight = spline_basis.window_flat(t, start, own)
-        at, along = ((w[..., None] * coefficient[rows]).sum(-2) for w in (weight, d_weight))
-        y = (M @ (at - position)[..., None])[..., 0]
-        dy = (M @ along[..., None])[..., 0]
-        depth = y[:, 2:].clamp_min(MIN_DEPTH)
-        error = y[:, :2] / depth
-        tangent = (dy[:, :2] - error * dy[:, 2:]) / depth
-        if step < _STEPS:
-            change = (error * tangent).sum(-1) / tangent.square().sum(-1).clamp_min(1e-12)
-            # Half a knot beyond either end is far enough to see that the point is not on this spline.
-            t = torch.minimum((t - change.clamp(-2, 2)).clamp_min(-0.5), last + 0.5)
+    y, error, tangent = _projected(t, start, own, coefficient, M, position)
+    for _ in range(_STEPS):
+        change = (error * tangent).sum(-1) / tangent.square().sum(-1).clamp_min(1e-12)
+        # Half a knot beyond either end is far enough to see that the point is not on this spline.
+        t = torch.minimum((t - change.clamp(-2, 2)).clamp_min(-0.5), last + 0.5)
+        y, error, tangent = _projected(t, start, own, coefficient, M, position)
     tangent = torch.nn.functional.normalize(tangent, dim=-1)
     normal = torch.stack((-tangent[:, 1], tangent[:, 0]), dim=-1)
-    valid = (y[:, 2] > 1.0) & (t >= 0) & (t <= last)
+    # At one border for both ways a match may come and go with every step, each step undoing the last one.
+    slack = torch.where(matches.valid, _SLACK, -_SLACK).to(t)
+    valid = (y[:, 2] > 1.0) & (t >= -slack) & (t <= last + slack)
     return replace(matches, t=t, normal_px=normal, valid=valid)
+
+
+def _projected(
+    t: Float[Tensor, " m"],
+    start: Int[Tensor, " m"],
+    count: Int[Tensor, " m"],
+    coefficient: Float[Tensor, "c 3"],
+    matrix: Float[Tensor, "m 3 3"],
+    position: Float[Tensor, "m 3"],
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 2"], Float[Tensor, "m 2"]]:
+    """Spline points in the observations' frames, their pixel errors, and how these move with the parameter."""
+    rows, weight, d_weight = spline_basis.window_flat(t, start, count)
+    at, along = ((w[..., None] * coefficient[rows]).sum(-2) for w in (weight, d_weight))
+    y = (matrix @ (at - position)[..., None])[..., 0]
+    dy = (matrix @ along[..., None])[..., 0]
+    depth = y[:, 2:].clamp_min(MIN_DEPTH)
+    error = y[:, :2] / depth
+    return y, error, (dy[:, :2] - error * dy[:, 2:]) / depth
 
 
 def detection_lanes(

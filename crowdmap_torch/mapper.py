@@ -1,8 +1,8 @@
 """The straight line from detections to a map, in the order of the paper: read this file first.
 
 One journey (section IV): detections -> tracklets -> signs; road normal; lane tracklets -> splines. Many journeys
-(section V): signs -> clusters and biases, lanes -> markers; then everything at once in bundle adjustment. `build_map` does it
-all; `scripts/optimize.py` spells out the same calls with logging between them.
+(section V): signs -> clusters and biases, lanes -> markers; then everything at once in bundle adjustment. `build_map`
+does it all; `scripts/optimize.py` spells out the same calls with logging between them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Rows of bundle adjustment: every sign corner and lane point of all journeys, with its pose, landmark and observation matrix."""
+"""Rows of bundle adjustment: every sign corner and lane point of all journeys, with its frame and landmark."""
 
 from __future__ import annotations
 

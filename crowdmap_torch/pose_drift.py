@@ -1,7 +1,8 @@
 """Drift of a journey's poses around a landmark: a polyline of position errors over the way, bound to be a random walk.
 
-The landmark is placed relative to the pose at its closest view, where the drift is held at zero; towards the other views it
-may grow with the square root of the distance. All of it is rows of small independent problems, one per landmark.
+The landmark is placed relative to the pose at its closest view, where the drift is held at zero; towards the other
+views it may grow with the square root of the distance. All of it is rows of small independent problems, one per
+landmark.
 """
 
 from __future__ import annotations

@@ -209,7 +209,7 @@ def lane_reprojection_jacobian(
     weights: Float[Tensor, "m 4"],
     normal_px: Float[Tensor, "m 2"],
     observation: Float[Tensor, "m 3 3"],
-) -> tuple[Float[Tensor, "m 1"], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+) -> tuple[Float[Tensor, "m 1"], tuple[Tensor, ...]]:
     """`lane_reprojection` and its Jacobians by camera pose and the four coefficients."""
     point_world = (torch.stack((c0, c1, c2, c3), dim=-1) @ weights[..., None])[..., 0]
     # The image normal turns the two rows of the observation into one before anything is differentiated.
@@ -230,7 +230,7 @@ def lane_height_jacobian(
     weights: Float[Tensor, "m 4"],
     road_normal_camera: Float[Tensor, "m 3"],
     camera_height: Float[Tensor, " m"],
-) -> tuple[Float[Tensor, "m 1"], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+) -> tuple[Float[Tensor, "m 1"], tuple[Tensor, ...]]:
     """`lane_height` and its Jacobians by camera pose and the four coefficients."""
     point_world = (torch.stack((c0, c1, c2, c3), dim=-1) @ weights[..., None])[..., 0]
     point_camera, by_rotation_of = _into_camera(T_world_camera, point_world)

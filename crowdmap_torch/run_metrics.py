@@ -98,7 +98,10 @@ def metrics_of(
     summaries = journey_summaries(dataset, result)
     return {
         "counts": counts_of(dataset, result, config),
-        "pruned": [{"stage": p.stage, "reason": p.reason, "count": p.count} for p in pruned_of(dataset, result)],
+        "pruned": [
+            {"stage": p.stage, "reason": p.reason, "count": p.count}
+            for p in pruned_of(dataset, result)
+        ],
         "times_s": dict(seconds),
         "costs": [
             {"iteration": i.number, "accepted": i.accepted, "total": i.total, **i.cost}

@@ -1,10 +1,10 @@
 """Robust fits of signs to their detections in posed frames (IV-B), all signs at once.
 
-The poses of a journey are not exact, and their error hits all corners of a detection alike: it moves the sign in the image
-and leaves its outline. So one detection is one observation, whitened by its covariance: pixel noise of the corners, and the
-white noise of the pose that all of them share. What drifts slowly along the drive is estimated along with the sign
-(`pose_drift`). A sign is thus placed relative to the pose at its closest view; its size and depth rest on the outlines,
-which no pose error spoils.
+The poses of a journey are not exact, and their error hits all corners of a detection alike: it moves the sign in the
+image and leaves its outline. So one detection is one observation, whitened by its covariance: pixel noise of the
+corners, and the white noise of the pose that all of them share. What drifts slowly along the drive is estimated along
+with the sign (`pose_drift`). A sign is thus placed relative to the pose at its closest view; its size and depth rest
+on the outlines, which no pose error spoils.
 """
 
 from __future__ import annotations
@@ -67,6 +67,11 @@ class SignFitConfig:
     lm: lm.LmConfig = field(
         default_factory=lambda: lm.LmConfig(max_iterations=30, cost_tolerance=1e-4)
     )
+    """The minimisation."""
+    coarse_lm: lm.LmConfig = field(
+        default_factory=lambda: lm.LmConfig(max_iterations=12, cost_tolerance=1e-2)
+    )
+    """The minimisation from starts that are only to be compared."""
 
 
 @dataclass(frozen=True)
@@ -133,9 +138,10 @@ def fit_signs(
 ) -> SignFit:
     """Pose and size of every sign that minimise the Tukey-weighted whitened reprojection error (IV-B).
 
-    `facing` is the horizontal direction against the drive. Unlike the paper, the poses' white noise and drift are part of the
-    model. A view's own pose error is integrated out to first order around its estimate, which takes a second round: around
-    zero instead, views that are off to the side would make the sign seem further away than it is.
+    `facing` is the horizontal direction against the drive. Unlike the paper, the poses' white noise and drift are
+    part of the model. A view's own pose error is integrated out to first order around its estimate, which takes a
+    second round: around zero instead, views that are off to the side would make the sign seem further away than it
+    is.
     """
     away = (views.p_world_camera - start.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
     distance = signed_distance(views.p_world_camera, away, views.frame, views.sign)
@@ -173,7 +179,7 @@ def fit_signs_coarsely(
     extra = _distance(views, start).abs() * config.drift.sigma_m**2
     noise = _noise(views, views.T_world_camera, shape, start, nothing, ones, extra, config)
     problem, values = _problem(views, shape, start, noise, facing, config)
-    state = lm.solve(problem, values, config.lm)
+    state = lm.solve(problem, values, config.coarse_lm)
     whitened = _whitened(problem, state.values, shape, views)
     return _read(problem, state, _mean_square(whitened, shape, views))
 
@@ -436,7 +442,8 @@ def _pose_error(
     by_pose = noise.whitening @ noise.by_pose
     posterior = noise.pose_variance * (by_pose.mT @ whitened[..., None])[..., 0]
     has_say = _mean_square(whitened, shape, views) < config.tukey**2
-    # The error is predicted minus observed: a camera that is off by d makes it by_pose d larger, and is corrected by -d.
+    # The error is predicted minus observed: a camera that is off by d makes it by_pose d larger, and is corrected by
+    # -d.
     return torch.where(has_say[:, None], -posterior, torch.zeros_like(posterior))
 
 

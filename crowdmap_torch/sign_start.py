@@ -26,8 +26,9 @@ def centre_points(
 ) -> Float[Tensor, "count 3"]:
     """Mid-points of the rays to the means of each sign's corners, robust to views that are far off (IV-B).
 
-    Rays are weighted by one over their distance squared, so that angles count and not metres, and reweighted by one over
-    their angle: what remains is near the median. Where a mid-point lies behind a camera a sign of typical height gives the depth.
+    Rays are weighted by one over their distance squared, so that angles count and not metres, and reweighted by one
+    over their angle: what remains is near the median. Where a mid-point lies behind a camera a sign of typical height
+    gives the depth.
     """
     ray = _mean_ray(views)
     origin = views.p_world_camera

@@ -1,8 +1,8 @@
 """The nouns: flat tables of tensors with integer key columns.
 
-A detection row says its frame, a landmark row its journey, a control point its lane. Association and clustering are label
-columns (-1 = none). World: local East-North-Up [m]. Camera: x right, y down, z forward. Sign: x right and y up as the
-driver sees it, z the normal that points at the driver; its origin is the mean of its corners.
+A detection row says its frame, a landmark row its journey, a control point its lane. Association and clustering are
+label columns (-1 = none). World: local East-North-Up [m]. Camera: x right, y down, z forward. Sign: x right and y up
+as the driver sees it, z the normal that points at the driver; its origin is the mean of its corners.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Maps a dataset: `optimize.py DATASET --out RUN [--config configs/NAME.yaml] [--device cpu|cuda]`.
 
 Reads like a training loop: load, map each journey, tell the landmarks of all journeys apart, then adjust everything at
-once, step by step, watched in TensorBoard; last the map, its errors against the survey, and a report. `RUN` is described in
-FORMAT.md. Exit code 2: the input or the configuration is wrong, said in one line.
+once, step by step, watched in TensorBoard; last the map, its errors against the survey, and a report. `RUN` is
+described in FORMAT.md. Exit code 2: the input or the configuration is wrong, said in one line.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def projected_errors(rows: LanePointObservations, T: Tensor, point: Tensor) -> T
 @pytest.mark.parametrize("lane", [0, 1, 2])
 def test_follow_ends_at_the_closest_point_of_the_projected_spline(lanes: Lanes, lane: int):
     T = camera_at(5.0)
-    x = torch.linspace(13, 40, 15, dtype=torch.float64)
+    x = torch.linspace(16, 40, 15, dtype=torch.float64)
     aside = 0.25 * torch.sin(3 * x)
     rows = observe(seen_points(lanes, T, aside, x, lane))
     count = lanes.control_count
@@ -161,7 +161,7 @@ def test_follow_ends_at_the_closest_point_of_the_projected_spline(lanes: Lanes, 
 
 def test_follow_stays_where_the_match_is_right_already(lanes: Lanes):
     T = camera_at(5.0)
-    x = torch.linspace(13, 40, 10, dtype=torch.float64)
+    x = torch.linspace(16, 40, 10, dtype=torch.float64)
     rows = observe(seen_points(lanes, T, 0.1 + 0 * x, x, 2))
     count = lanes.control_count
     coefficient = spline_basis.to_coefficients_flat(lanes.control.point_world, count)
@@ -186,6 +186,26 @@ def test_points_beyond_the_end_or_behind_the_camera_are_not_valid(lanes: Lanes):
     assert found.valid.tolist() == [False, True, False]
     behind = follow(start, rows, camera_at(60.0).expand(3, 4, 4), coefficient, count)
     assert not behind.valid.any() and behind.t.isfinite().all() and behind.normal_px.isfinite().all()
+
+
+def test_a_match_at_the_end_of_a_spline_does_not_come_and_go(lanes: Lanes):
+    make = Builder()
+    T = camera_at(5.0)
+    x = torch.tensor([20.0], dtype=torch.float64)
+    rows = observe(seen_points(lanes, T, 0 * x, x, 0))
+    nothing = torch.zeros(1, 2, dtype=torch.float64)
+    valid = torch.ones(1, dtype=torch.bool)
+    # A step moves the end a few centimetres to and fro across the point; then it moves away, and back.
+    seen = []
+    for end in (20.03, 19.97, 20.03, 19.97, 19.0, 19.97, 20.03, 21.0):
+        lane = make.lanes([make.straight(0.0, start=0, end=end, points=3)])
+        coefficient = spline_basis.to_coefficients_flat(
+            lane.control.point_world, lane.control_count
+        )
+        start = LaneMatches(torch.zeros(1, dtype=torch.int64), nothing[:, 0] + 1, nothing, valid)
+        valid = follow(start, rows, T[None], coefficient, lane.control_count).valid
+        seen.append(bool(valid))
+    assert seen == [True, True, True, True, False, False, False, True]
 
 
 # Lanes of detections.

@@ -17,8 +17,8 @@ def gated_matching(
 ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
     """Rows and columns of the partial matching that minimises the sum of costs, an unmatched pair counted as `gate`.
 
-    Pairs that cost `gate` or more, infinity included, are never matched. One excellent pair is thus not given up for two
-    poor ones. Rows come in ascending order.
+    Pairs that cost `gate` or more, infinity included, are never matched. One excellent pair is thus not given up for
+    two poor ones. Rows come in ascending order.
     """
     row, column = match_arrays(cost.detach().cpu().numpy(), gate)
     return torch.from_numpy(row).to(cost.device), torch.from_numpy(column).to(cost.device)
@@ -28,7 +28,8 @@ def match_arrays(
     cost: Float[np.ndarray, "n m"], gate: float
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """`gated_matching` of NumPy's arrays, for loops over frames."""
-    # What a match gains over none: where that is zero, an assignment of all rows may still pass through, and is dropped.
+    # What a match gains over none: where that is zero, an assignment of all rows may still pass through, and is
+    # dropped.
     gain = np.maximum(gate - cost, 0)
     row, column = linear_sum_assignment(gain, maximize=True)
     matched = gain[row, column] > 0

@@ -108,7 +108,9 @@ def _support(curves: Curves, matched: Match, weight: Float[Tensor, " s"]) -> Flo
 
 def nearest_row(curves: Curves, matched: Match) -> Int[Tensor, " s"]:
     """The point of its curve that each matched sample is nearest to; -1 for the others."""
-    far = float(curves.station.max()) + 10.0 if len(curves.station) else 0.0
+    if not len(curves):
+        return torch.full_like(matched.curve, -1)
+    far = float(curves.station.max()) + 10.0
     x = curves.station + curves.curve * far
     y = matched.station.clamp_min(0) + matched.curve.clamp_min(0) * far
     above = torch.searchsorted(x, y).clamp(1, max(len(x) - 1, 1))

@@ -9,7 +9,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.lines import LineSamples
 from crowdmap_torch.courses.curves import Curves, Match
 
-_BIN = 2.0
+_BIN = 1.0
 """Support is counted over stretches of this length [m]."""
 
 
@@ -44,12 +44,15 @@ def supported_rows(
 ) -> Bool[Tensor, " k"]:
     """Points of curves from the first to the last place that at least `min_owners` owners saw."""
     used = (matched.curve >= 0) & samples.is_witness
-    bins = int((curves.station / _BIN).max()) + 2 if len(curves.station) else 1
-    place = matched.curve[used] * bins + (matched.station[used] / _BIN).long().clamp(0, bins - 1)
+    bins = int((curves.station / _BIN).max()) + 3 if len(curves.station) else 1
     owners = int(samples.owner.max()) + 1 if len(samples) else 1
-    seen = torch.unique(place * owners + samples.owner[used]) // owners
+    at = (matched.station[used] / _BIN).floor().long() + 1
+    # A sample stands for a stretch of its own: the bins beside its own are seen too.
+    place = torch.cat([(at + k).clamp(0, bins - 1) for k in (-1, 0, 1)])
+    place = place + matched.curve[used].repeat(3) * bins
+    seen = torch.unique(place * owners + samples.owner[used].repeat(3)) // owners
     enough = torch.bincount(seen, minlength=len(curves) * bins) >= min_owners
-    own = (curves.station / _BIN).long().clamp(0, bins - 1)
+    own = (curves.station / _BIN).floor().long() + 1
     is_seen = enough[curves.curve * bins + own]
     row = torch.arange(len(own), device=own.device)
     low = torch.full((len(curves),), len(row), device=row.device)

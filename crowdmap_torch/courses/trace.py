@@ -27,7 +27,7 @@ class TraceConfig:
     min_share: float = 0.1
     """Of the journeys that saw any marker nearby, at least this share must support a place."""
     short_m: float = 40.0
-    """Courses shorter than this must be supported by more, as strayed pieces may happen to agree over a short way: ..."""
+    """Shorter courses must be supported by more, as strayed pieces may happen to agree over a short way: ..."""
     short_share: float = 0.8
     """... by this share of the journeys nearby at no length, falling to `min_share`."""
     nearby_m: float = 8.0

@@ -1,4 +1,4 @@
-"""Which vertex of one outline is which of another: epipolar costs of all pairs of vertices, and cyclic orders (IV-A)."""
+"""Which vertex of one outline is which of another: costs of all pairs of vertices, and cyclic orders (IV-A)."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def rotation_compensated(
 ) -> Float[Tensor, "b n m"]:
     """Squared distances on z = 1 of every point of one view and every point of the other turned into its frame.
 
-    Where the baseline is short this is what is left of the epipolar constraint. A point of b that the rotation takes behind
-    a is infinitely far.
+    Where the baseline is short this is what is left of the epipolar constraint. A point of b that the rotation takes
+    behind a is infinitely far.
     """
     turned = torch.nn.functional.pad(q_b, (0, 1), value=1.0) @ R_a_b.mT
     in_front = turned[..., 2] > 1e-6

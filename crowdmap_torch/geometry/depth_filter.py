@@ -1,13 +1,15 @@
 """A running estimate of where an upright thing of unknown size is, from a moving camera: bearing, depth, height.
 
-The state of each thing is `(x, y, lambda, eta)`: its bearing on the plane z = 1 and the logarithm of its inverse depth in
-the camera of the last update, and the logarithm of its height [m]. A sighting measures the bearing and `lambda + eta`, the
-logarithm of the height it appears with on z = 1. At a standstill the prediction is the rotation-compensated image and its
-covariance is small; with a baseline it stretches along the epipolar line, as far as the depth is unknown. One Mahalanobis
-distance is thus the pixel distance, the epipolar distance or the distance to a predicted point, whichever the motion allows
-(compare Civera, Davison and Montiel 2008, inverse depth parametrisation).
+The state of each thing is `(x, y, lambda, eta)`: its bearing on the plane z = 1 and the logarithm of its inverse
+depth in the camera of the last update, and the logarithm of its height [m]. A sighting measures the bearing and
+`lambda + eta`, the logarithm of the height it appears with on z = 1. At a standstill the prediction is the
+rotation-compensated image and its covariance is small; with a baseline it stretches along the epipolar line, as far
+as the depth is unknown. One Mahalanobis distance is thus the pixel distance, the epipolar distance or the distance to
+a predicted point, whichever the motion allows (compare Civera, Davison and Montiel 2008, inverse depth
+parametrisation).
 
-Arrays are NumPy's: the filter runs frame after frame on a handful of things, where the overhead of a call is all it costs.
+Arrays are NumPy's: the filter runs frame after frame on a handful of things, where the overhead of a call is all it
+costs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The back end for chains: one variable's blocks are eliminated level by level, the rest is one small dense system.
 
 Bundle adjustment of a map has frames by the ten thousand, each bound to the next, and landmarks by the hundred: what is
-eliminated are the frames, the reverse of the usual habit. `chain_structure` says in which order; here is the arithmetic.
+eliminated are the frames, the reverse of the usual habit. `chain_structure` says in which order; here is the
+arithmetic.
 """
 
 from __future__ import annotations
@@ -290,7 +291,9 @@ def _assemble(
                 diagonal.index_add_(0, block, outer(JW, J))
                 chain_gradient.index_add_(0, block, (JW * linear.residual[..., None]).sum(1))
             if len(index) == 2:
-                _add_link(link, structure, *index, outer(weighted[0], linear.jacobians[1]))
+                _add_link(
+                    link, structure, index[0], index[1], outer(weighted[0], linear.jacobians[1])
+                )
         term_cost[name] = cost
 
     for name, coupling in structure.couplings.items():

@@ -1,10 +1,11 @@
 """The order in which chains of blocks are eliminated: nested dissection, worked out once per problem.
 
-Blocks of the eliminated variable form chains (the frames of a journey). Each may carry a leaf, a block of a second variable
-that is bound to it alone (the frame's own pose, where the chain is its slow drift): leaves go first. A chain is cut into tiles of `tile_size` interior
-blocks and one separator; the interiors are eliminated, the separators are the chain of the next level, and so on until no
-block is left. Tiles that see the same landmarks (the same stretch of road, driven by anybody) form a group with one window
-of columns, so that the products of a whole group are one matrix product and nothing is padded to the widest of all.
+Blocks of the eliminated variable form chains (the frames of a journey). Each may carry a leaf, a block of a second
+variable that is bound to it alone (the frame's own pose, where the chain is its slow drift): leaves go first. A chain
+is cut into tiles of `tile_size` interior blocks and one separator; the interiors are eliminated, the separators are
+the chain of the next level, and so on until no block is left. Tiles that see the same landmarks (the same stretch of
+road, driven by anybody) form a group with one window of columns, so that the products of a whole group are one matrix
+product and nothing is padded to the widest of all.
 """
 
 from __future__ import annotations
@@ -122,8 +123,8 @@ def analyse(
 ) -> ChainStructure:
     """The elimination of `eliminate`, whose blocks lie chain by chain, in order, and of the `leaves` on them.
 
-    Every row may touch one eliminated block and any landmarks, or one or two eliminated blocks: neighbours of a chain, or
-    a leaf and the block that carries it.
+    Every row may touch one eliminated block and any landmarks, or one or two eliminated blocks: neighbours of a
+    chain, or a leaf and the block that carries it.
     """
     leaf_count = 0 if carrier is None else len(carrier)
     base = {eliminate: 0} if leaves is None else {leaves: 0, eliminate: leaf_count}
@@ -204,7 +205,9 @@ def _levels(
     pending = {name: torch.arange(len(c.block), device=device) for name, c in couplings.items()}
     while len(chain):
         leaf = chain < 0
-        cut = _leaf_tiles(carrier, len(chain)) if bool(leaf.any()) else _chain_tiles(chain, tile_size)
+        cut = (
+            _leaf_tiles(carrier, len(chain)) if bool(leaf.any()) else _chain_tiles(chain, tile_size)
+        )
         tile, slot, interior, left, right = cut.tile, cut.slot, cut.interior, cut.left, cut.right
         kept = torch.nonzero(~interior)[:, 0]
         tile_count = len(left)

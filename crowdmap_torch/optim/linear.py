@@ -38,8 +38,15 @@ class Step:
 class NormalEquations(Protocol):
     """The quadratic model of the cost around a point."""
 
-    cost: Float[Tensor, " groups"]
-    term_cost: Mapping[str, Float[Tensor, " groups"]]
+    @property
+    def cost(self) -> Float[Tensor, " groups"]:
+        """Cost at the point."""
+        ...
+
+    @property
+    def term_cost(self) -> Mapping[str, Float[Tensor, " groups"]]:
+        """The same by term."""
+        ...
 
     def solve(self, damping: Float[Tensor, " groups"]) -> Step:
         """The step of the model whose Hessian's diagonal is raised by the factor `1 + damping`."""

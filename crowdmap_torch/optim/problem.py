@@ -1,7 +1,8 @@
 """Nonlinear least squares as data: variables on manifolds, cost terms, and the problem they make.
 
-A variable is a stack of blocks (camera poses, sign planes, spline coefficients), each with its own small tangent space. A
-cost term is a stack of rows (observations); each row touches one block per slot. Nothing here knows what a camera is.
+A variable is a stack of blocks (camera poses, sign planes, spline coefficients), each with its own small tangent
+space. A cost term is a stack of rows (observations); each row touches one block per slot. Nothing here knows what a
+camera is.
 """
 
 from __future__ import annotations

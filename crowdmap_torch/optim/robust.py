@@ -1,4 +1,4 @@
-"""Robust losses of the squared norm of a whitened residual: rho(s), and the weight rho'(s) of iterated least squares."""
+"""Robust losses of the squared norm s of a whitened residual: rho(s), and the weight rho'(s)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is watched while bundle adjustment runs: costs, solver, residuals, errors against the survey, the map from above."""
+"""What is watched while bundle adjustment runs: costs, residuals, errors against the survey, the map."""
 
 from __future__ import annotations
 

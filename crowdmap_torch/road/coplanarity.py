@@ -85,7 +85,7 @@ class NormalUpdates:
 
 
 def pick_nodes(
-    level: Level, station: Float[Tensor, " f+1"], config: CoplanarityConfig
+    level: Level, station: Float[Tensor, " stations"], config: CoplanarityConfig
 ) -> PoseNodes:
     """The first pose in each cell that frames newly enter.
 

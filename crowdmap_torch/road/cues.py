@@ -134,7 +134,7 @@ def measure(
     return Measurements(level.advance, dt, row, known, value, variance), after
 
 
-def _passes(station: Float[Tensor, " f+1"], every: float) -> Bool[Tensor, " f"]:
+def _passes(station: Float[Tensor, " stations"], every: float) -> Bool[Tensor, " f"]:
     """True for frames in which the way passes a multiple of a length."""
     index = (station / every).floor()
     return index[1:] > index[:-1]

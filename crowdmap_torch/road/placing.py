@@ -57,6 +57,8 @@ def place_on_surface(journey: Journey, road: RoadEstimate) -> PlacedPoints:
     met later. From the frame that sees a point to the frame that sees it from nearest the way is
     reckoned, so the drift of positions between is not in it.
     """
+    if not len(journey.lane_points):
+        return place_on_planes(journey, road)
     level = level_of(journey)
     alpha, beta = slopes_of_normal(road.normal_camera, level.R_road_camera)
     surface = lay_surface(level, alpha, beta, road.height)

@@ -1,8 +1,8 @@
 """V-B: bundle adjustment of camera poses, signs and lanes of all journeys (eq:ba).
 
-`build` makes a `Bundle` from journeys, a first map and the associations. The loop over it reads like training: `refresh`, a
-step of the solver, `fold`; `adjust` is that loop for those who need no logging. `read_signs`, `read_lanes` and `read_poses` give
-the result.
+`build` makes a `Bundle` from journeys, a first map and the associations. The loop over it reads like training:
+`refresh`, a step of the solver, `fold`; `adjust` is that loop for those who need no logging. `read_signs`,
+`read_lanes` and `read_poses` give the result.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from crowdmap_torch import residuals
@@ -46,8 +46,8 @@ def build(
 ) -> Bundle:
     """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
 
-    `drifts` are tangents per frame, from the positioning module's pose to the start pose. Journeys `left_out`, by number,
-    have no say.
+    `drifts` are tangents per frame, from the positioning module's pose to the start pose. Journeys `left_out`, by
+    number, have no say.
     """
     offsets = frame_offsets(journeys)
     prior = torch.cat([journey.T_world_camera for journey in journeys])
@@ -98,7 +98,7 @@ def build(
     }
     fixed = _pose_terms(journeys, prior[frame], nodes, config)
     fixed.update(_lane_prior(values["lane"], lanes, config))
-    tree = cKDTree(values["pose"][:, :3, 3].cpu().numpy()) if len(frame) else None
+    tree = KDTree(values["pose"][:, :3, 3].cpu().numpy()) if len(frame) else None
     beside = torch.zeros(0, dtype=torch.long, device=frame.device)
     if tree is not None:
         _, nearest = tree.query(values["lane"].cpu().numpy())

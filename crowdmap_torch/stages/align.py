@@ -167,8 +167,8 @@ def align_journeys(
 
     `station` [m] is the distance driven to where each sign was closest; `start` the bias known so far; `bias_sigma` [m]
     its prior; `journey_weight` and the `certainty` of each sign being in the right cluster are 0 to 1. What all
-    journeys share cannot be seen: the mean of the biases, weighted by their priors, is zero. Unlike the paper, the bias drifts
-    along the journey and turns with it, and outliers have no say.
+    journeys share cannot be seen: the mean of the biases, weighted by their priors, is zero. Unlike the paper, the
+    bias drifts along the journey and turns with it, and outliers have no say.
     """
     journeys = len(start)
     if bias_sigma is None:

@@ -1,8 +1,8 @@
 """IV-A: sign detections of one journey -> tracklets, frame after frame.
 
 The epipolar cost of two detections depends on nothing but the two, so all pairs within the association window are one
-batched kernel (`sign_pair_costs`); the causal loop (`SignAssociator`) looks costs up, predicts where each tracklet should
-appear, and matches. `SingleJourneyMapper` steps the same associator with the costs of one frame at a time.
+batched kernel (`sign_pair_costs`); the causal loop (`SignAssociator`) looks costs up, predicts where each tracklet
+should appear, and matches. `SingleJourneyMapper` steps the same associator with the costs of one frame at a time.
 """
 
 from __future__ import annotations
@@ -54,6 +54,9 @@ class SignAssociationConfig:
     measurement may have been the wrong one; method `predicted`."""
     shape_penalty: float = 6.0
     """Added to the cost where a detection's shape is not the tracklet's shape by vote."""
+    young_penalty: float = 4.0
+    """Added to the cost of a tracklet with one measurement, half of it with two, and so on: of two tracklets of one sign, one
+    begun by a second detection in a frame, the older goes on."""
     track_bonus: float = 2.0
     """Taken off where the perception module's track number agrees: a hint, which may be wrong."""
     sigma_px: float = 1.0
@@ -184,8 +187,8 @@ def sign_pair_costs(
 
     Vertices are matched in the best cyclic order; detections of different shapes are compared by their boxes. Where the
     baseline is too short to move a sign of typical size by more than the noise, the epipolar lines say nothing, and the
-    rotation-compensated pixel distance takes over. Unlike the paper, the cost is the mean and not the sum over vertices, so
-    that one threshold serves all shapes.
+    rotation-compensated pixel distance takes over. Unlike the paper, the cost is the mean and not the sum over
+    vertices, so that one threshold serves all shapes.
     """
     F_ab = fundamental(a.T_world_camera, b.T_world_camera)
     T_a_b = se3.inverse(a.T_world_camera) @ b.T_world_camera
@@ -387,14 +390,16 @@ class SignAssociator:
         epipolar = epipolar_px2 / (c.sigma_px**2 + pose_px2 * self._pose_variance)
         refused = innovation.distance_sq > c.max_distance**2
         refused |= (depth < c.min_depth_m) | (depth > c.max_depth_m)
-        # A tracklet that is known well enough to be predicted may break the epipolar gate: its last measurement may have
+        # A tracklet that is known well enough to be predicted may break the epipolar gate: its last measurement may
+        # have
         # been the wrong one.
-        sure = (old.votes.sum(-1) >= c.sure_after)[:, None]
+        count = old.votes.sum(-1)[:, None]
+        sure = count >= c.sure_after
         refused |= ~sure & (epipolar > (c.max_epipolar_px / c.sigma_px) ** 2)
         epipolar = np.where(sure, np.minimum(epipolar, SURE_EPIPOLAR_COST), epipolar)
         shape, track = sights.shape[rows], sights.track[rows]
         hinted = (sights.track[old.last][:, None] == track) & (track >= 0)
-        cost = innovation.distance_sq + innovation.vagueness + epipolar
+        cost = innovation.distance_sq + innovation.vagueness + epipolar + c.young_penalty / count
         cost += c.shape_penalty * (old.votes.argmax(-1)[:, None] != shape)
         cost -= c.track_bonus * hinted
         cost[refused] = np.inf

@@ -289,8 +289,9 @@ def _supported(
     )
     # Stretches of four metres seen, not samples: pieces overlap.
     stretch = (matched.station[used] / 4.0).floor().long().clamp_min(0)
-    seen = torch.unique(group * (int(stretch.max()) + 1 if len(stretch) else 1) + stretch)
-    covered = 4.0 * torch.bincount(seen // (int(stretch.max()) + 1), minlength=len(key))
+    stretches = int(stretch.max()) + 1 if len(stretch) else 1
+    seen = torch.unique(group * stretches + stretch) // stretches
+    covered = 4.0 * torch.bincount(seen, minlength=len(key))
     curve = key // owners
     enough = covered >= (0.2 * curves.length[curve]).clamp_max(20.0)
     journeys = torch.bincount(curve[enough], minlength=len(curves))

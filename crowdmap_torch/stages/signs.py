@@ -42,11 +42,14 @@ KEPT, FEW_FRAMES, NO_PARALLAX, TOO_FAR, BEHIND, RESIDUAL, UNCERTAIN, SIZE, REJOI
 
 @dataclass(frozen=True)
 class RejoinConfig:
-    """When two tracklets that no frame has both of are one sign."""
+    """When two tracklets are one sign."""
+
+    max_common_share: float = 0.1
+    """Tracklets with a larger share of the shorter one's frames in common are two signs: both were seen at once."""
 
     max_distance: float = 4.0
     """Centres further apart, in standard deviations of both and of the drift between them, are two signs."""
-    max_distance_m: float = 2.5
+    max_distance_m: float = 5.0
     """As are those further apart than this."""
     max_size_ratio: float = 1.5
     """As are signs whose width or height differ by more, beyond what the frames leave open."""
@@ -76,12 +79,18 @@ class SignTriangulationConfig:
     """Tracklets of whose views fewer agree with the sign are pruned."""
     max_sigma_m: float = 1.5
     """Tracklets whose centre has a larger standard deviation in any direction are pruned."""
+    doubtful_frames: int = 10
+    """Tracklets with fewer views in agreement must be better placed than others: false detections come in short runs."""
+    max_doubtful_sigma_m: float = 0.8
+    """Largest standard deviation of those."""
     size_m: tuple[float, float] = (0.1, 8.0)
     """Smallest and largest plausible width and height."""
     confident_frames: float = 4.0
     """Views in agreement, weighted by their scores, at which the confidence reaches 1 - 1/e."""
     start_yaw_deg: tuple[float, ...] = (-30.0, 30.0)
     """Angles from the line of sight to start from, beside the best plane."""
+    start_views: int = 16
+    """Views of each sign that the starts are compared on."""
     rejoin: RejoinConfig = field(default_factory=RejoinConfig)
     """When tracklets are put together again after a gap."""
     fit: SignFitConfig = field(default_factory=SignFitConfig)
@@ -130,7 +139,11 @@ def triangulate_signs(
     joined = group != torch.arange(len(label), device=group.device)
     if bool(joined.any()):
         reason[label[joined]] = REJOINED
-        tracklets = replace(tracklets, label=_relabelled(tracklets, label, group))
+        tracklets = replace(tracklets, label=_relabelled(tracklets, journey, label, group))
+        # Second detections of a frame stay with the tracklet that is given up.
+        still = tracklets.label[rows] == label[group][views.sign]
+        rows, views = rows[still], views[still]
+        fit = replace(fit, error_sq=fit.error_sq[still])
         label, new_row = label[~joined], (~joined).cumsum(0) - 1
         views = replace(views, sign=new_row[group][views.sign])
         again = torch.isin(views.sign, new_row[group[joined]])
@@ -190,16 +203,16 @@ def _fit(
     views: SignViews, shape: Int[Tensor, " n"], config: SignTriangulationConfig
 ) -> tuple[SignFit, Float[Tensor, " n"]]:
     """Signs fitted from several starts without the drift, then from the best one with it; and their noise scales."""
-    n, m = len(shape), len(views)
-    centre = centre_points(views, n, typical_height_m=config.fit.typical_size_m)
-    facing = against_the_drive(views, n)
+    n = len(shape)
+    few = views[_thinned(views, config.start_views)]
+    m = len(few)
+    centre = centre_points(few, n, typical_height_m=config.fit.typical_size_m)
+    facing = against_the_drive(few, n)
     yaws = tuple(math.radians(yaw) for yaw in config.start_yaw_deg)
-    begin = starts(views, shape, centre, yaws=yaws, size_limits=config.size_m)
+    begin = starts(few, shape, centre, yaws=yaws, size_limits=config.size_m)
     k = len(begin)
     coarse = fit_signs_coarsely(
-        concatenate(
-            [replace(views, sign=views.sign + i * n) for i in range(k)]
-        ),
+        concatenate([replace(few, sign=few.sign + i * n) for i in range(k)]),
         shape.repeat(k),
         SignStart(torch.cat([s.T_world_sign for s in begin]), torch.cat([s.size for s in begin])),
         facing.repeat(k, 1),
@@ -208,11 +221,24 @@ def _fit(
     cost = torch.where(coarse.cost.isfinite(), coarse.cost, torch.inf).reshape(k, n)
     choice = cost.argmin(0)
     best = choice * n + torch.arange(n, device=shape.device)
-    view = choice[views.sign] * m + torch.arange(m, device=shape.device)
+    view = choice[few.sign] * m + torch.arange(m, device=shape.device)
     most = config.fit.max_noise_scale
-    scale = robust_noise_scale(coarse.error_sq[view], views.sign, n, most)
+    scale = robust_noise_scale(coarse.error_sq[view], few.sign, n, most)
     start = SignStart(coarse.T_world_sign[best], coarse.size[best])
     return fit_signs(views, shape, start, facing, scale, config.fit), scale
+
+
+def _thinned(views: SignViews, most: int) -> Bool[Tensor, " m"]:
+    """About `most` views of each sign, spread evenly over its frames, the last one among them."""
+    order = torch.argsort(views.frame, stable=True)
+    order = order[torch.argsort(views.sign[order], stable=True)]
+    count = torch.bincount(views.sign)
+    first = (count.cumsum(0) - count)[views.sign[order]]
+    rank = torch.arange(len(order), device=order.device) - first
+    share = rank * most // count[views.sign[order]].clamp_min(most)
+    last = torch.ones_like(share, dtype=torch.bool)
+    last[:-1] = (share[1:] != share[:-1]) | (rank[1:] == 0)
+    return torch.zeros_like(last).index_put((order,), last)
 
 
 def _refit(
@@ -271,21 +297,27 @@ def _rejoin(
         & (ratio < rules.max_size_ratio * slack)
     )
     candidates = pairs[agrees][torch.argsort(distance_sq[agrees], stable=True)]
-    return _without_common_frames(views, candidates, n)
+    return _exclusive_groups(views, candidates, n, rules.max_common_share)
 
 
-def _without_common_frames(
-    views: SignViews, pairs: Int[Tensor, "p 2"], n: int
+def _exclusive_groups(
+    views: SignViews, pairs: Int[Tensor, "p 2"], n: int, max_common_share: float
 ) -> Int[Tensor, " n"]:
-    """Groups made by joining pairs in order, unless a frame shows both: two things seen at once are two things."""
+    """Groups made by joining pairs in order, unless many frames show both: two things seen at once are two things.
+
+    Some frames may: a sign that is detected twice in a frame is in two tracklets there.
+    """
     group = list(range(n))
-    concerned = set(pairs.flatten().tolist())
     frames = {
-        sign: set(views.frame[views.sign == sign].tolist()) for sign in sorted(concerned)
+        sign: set(views.frame[views.sign == sign].tolist())
+        for sign in sorted(set(pairs.flatten().tolist()))
     }
     for a, b in pairs.tolist():
         first, second = sorted((group[a], group[b]))
-        if first == second or frames[first] & frames[second]:
+        if first == second:
+            continue
+        most = max_common_share * min(len(frames[first]), len(frames[second]))
+        if len(frames[first] & frames[second]) > most:
             continue
         frames[first] |= frames.pop(second)
         group = [first if g == second else g for g in group]
@@ -293,11 +325,22 @@ def _without_common_frames(
 
 
 def _relabelled(
-    tracklets: Tracklets, label: Int[Tensor, " n"], group: Int[Tensor, " n"]
+    tracklets: Tracklets, journey: Journey, label: Int[Tensor, " n"], group: Int[Tensor, " n"]
 ) -> Int[Tensor, " d"]:
+    """Labels after tracklets were rejoined; in a frame that both have, the one that takes over keeps its own detection."""
     new = torch.arange(tracklets.count, device=label.device)
     new[label] = label[group]
-    return torch.where(tracklets.label >= 0, new[tracklets.label], -1)
+    old = tracklets.label.clamp_min(0)
+    moved = (tracklets.label >= 0) & (new[old] != old)
+    # Of each frame and new label the first row counts, and rows that keep their label come first.
+    order = torch.argsort(moved.long(), stable=True)
+    key = (new[old] * journey.frame_count + journey.signs.frame)[order]
+    by_key = torch.argsort(key, stable=True)
+    repeated = torch.zeros_like(moved)
+    repeated[1:] = key[by_key][1:] == key[by_key][:-1]
+    second = torch.zeros_like(moved)
+    second[order[by_key]] = repeated
+    return torch.where(moved & ~second, new[old], tracklets.label)
 
 
 def _closest_distance(views: SignViews, fit: SignFit) -> Float[Tensor, " n"]:
@@ -320,16 +363,19 @@ def _fates(
     agrees = (fit.error_sq < config.fit.tukey**2).to(scale)
     number = group_sum(torch.ones_like(agrees), views.sign, n)
     sigma = torch.linalg.eigvalsh(fit.covariance)[:, -1].clamp_min(0).sqrt()
+    agreeing = group_sum(agrees, views.sign, n)
+    is_doubtful = agreeing < config.doubtful_frames
+    doubtful = min(config.max_doubtful_sigma_m, config.max_sigma_m)
     low, high = config.size_m
     tests = (
         (BEHIND, group_sum(is_behind, views.sign, n) > 0),
         (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(config.min_parallax_deg)),
         (TOO_FAR, _closest_distance(views, fit) > config.max_distance_m),
         (SIZE, ((fit.size < low) | (fit.size > high)).any(-1)),
-        (FEW_FRAMES, group_sum(agrees, views.sign, n) < config.min_frames),
-        (RESIDUAL, group_sum(agrees, views.sign, n) < config.min_inlier_share * number),
+        (FEW_FRAMES, agreeing < config.min_frames),
+        (RESIDUAL, agreeing < config.min_inlier_share * number),
         (RESIDUAL, scale > config.max_noise_scale),
-        (UNCERTAIN, ~(sigma < config.max_sigma_m)),
+        (UNCERTAIN, ~(sigma < torch.where(is_doubtful, doubtful, config.max_sigma_m))),
     )
     fate = torch.full_like(views.sign[:1].expand(n), KEPT).clone()
     for code, fails in tests:

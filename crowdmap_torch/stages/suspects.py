@@ -26,9 +26,9 @@ class SuspectConfig:
     """Biases below this are never suspicious [m]."""
     min_scatter_m: float = 0.7
     """Median miss of its signs, bias and drift taken off, that is never suspicious below [m]."""
-    min_turn_deg: float = 1.5
+    min_turn_deg: float = 2.0
     """Median turn of its signs against the crowd's that is never suspicious below [deg]."""
-    min_stretch: float = 0.1
+    min_stretch: float = 0.035
     """Median relative size against the crowd's that is never suspicious below."""
     min_drift_m: float = 1.25
     """Largest drift along a journey that is never suspicious below [m]."""

@@ -27,7 +27,7 @@ def test_a_common_shift_does_not_swap_neighbours():
     row, slot = torch.cartesian_prod(torch.arange(2), torch.arange(2)).T
     cost = (signs[row] - heads[slot]).square().double()
     # The first sign is nearer to the second head, yet the pair fits best as a pair.
-    assert match_slots(row, slot, cost, rows=2, unmatched_cost=4).tolist() == [0, 1]
+    assert match_slots(row, slot, cost, rows=2, unmatched_cost=4.0).tolist() == [0, 1]
 
 
 def test_pairs_dearer_than_no_match_are_never_used():

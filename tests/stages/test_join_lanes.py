@@ -332,6 +332,29 @@ def test_no_pieces_make_no_lanes() -> None:
     assert len(joined.lanes) == len(joined.support) == len(joined.offsets) == 0
 
 
+@pytest.mark.parametrize("length", [3.0, 20.0, 200.0])
+def test_pieces_nobody_else_saw_make_no_lanes(length: float) -> None:
+    lines = [np.array([[0, 0, 0], [length, 0, 0]]) + np.array([0, 50.0 * j, 0]) for j in range(3)]
+    lanes = lane_world.pieces(
+        lines, type=[-1, 0, 1], journey=[0, 1, 2], tracklet=[0, 0, 0], frame=[5, 5, 5]
+    )
+    joined = join_lanes(lanes, CONFIG)
+    assert len(joined.lanes) == len(joined.support) == 0
+    assert (joined.piece_lane == -1).all()
+    assert (joined.offsets.offset_world == 0).all()
+
+
+def test_two_control_points_are_a_piece() -> None:
+    line_of_two = np.array([[0, 0, 0], [60.0, 0, 0]])
+    lanes = lane_world.pieces(
+        [line_of_two] * 2, type=[-1, 0], journey=[0, 1], tracklet=[0, 0], frame=[5, 5]
+    )
+    joined = join_lanes(lanes, CONFIG)
+    assert joined.lanes.type.tolist() == [0]
+    assert joined.lanes.control_count.tolist()[0] >= 4
+    torch.testing.assert_close(ends(joined.lanes)[0][0], torch.zeros(3).double(), rtol=0, atol=1.5)
+
+
 def test_offsets_are_the_journeys_drifts(world: lane_world.LaneWorld) -> None:
     # Against the true markers, the part across the road.
     reference = lane_world.pieces(

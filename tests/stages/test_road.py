@@ -25,12 +25,12 @@ F64 = torch.float64
 
 @pytest.fixture(scope="module")
 def hills(tmp_path_factory) -> SimulatedDrives:
-    return simulate(tmp_path_factory.mktemp("road") / "hills", "hills", length_m=400.0, journeys=2)
+    return simulate(tmp_path_factory.mktemp("road") / "hills", "hills", length_m=350.0, journeys=2)
 
 
 @pytest.fixture(scope="module")
 def suburb(tmp_path_factory) -> SimulatedDrives:
-    return simulate(tmp_path_factory.mktemp("road") / "suburb", "suburb", length_m=400.0, seed=3)
+    return simulate(tmp_path_factory.mktemp("road") / "suburb", "suburb", length_m=350.0, seed=3)
 
 
 def mean_error_deg(drives: SimulatedDrives, method: str) -> float:
@@ -75,7 +75,7 @@ def test_normals_are_unit_vectors_towards_the_road(suburb: SimulatedDrives) -> N
 def test_streaming_gives_what_the_batch_gives(
     suburb: SimulatedDrives, method: str, size: int
 ) -> None:
-    journey = frames_of(suburb.truths[0].journey, 0, 200 if size == 1 else 500)
+    journey = frames_of(suburb.truths[0].journey, 0, 120 if size == 1 else 400)
     config = RoadConfig(
         method=method, coplanarity=CoplanarityConfig(min_segments=1, segment_m=10.0, update_m=15.0)
     )

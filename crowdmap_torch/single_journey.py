@@ -1,0 +1,272 @@
+"""One drive as it happens (section IV): a causal mapper that takes one frame at a time."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.stages.associate import SignAssociator
+from crowdmap_torch.stages.associate_lanes import LaneAssociator
+from crowdmap_torch.stages.lanes import reconstruct_lanes
+from crowdmap_torch.stages.road import RoadTracker
+from crowdmap_torch.stages.signs import triangulate_signs
+from crowdmap_torch.tables import (
+    Journey,
+    LaneDetections,
+    Lanes,
+    Rig,
+    RoadEstimate,
+    SignDetections,
+    Signs,
+    Tracklets,
+    concatenate,
+)
+
+MAX_OPEN_FRAMES = 1500
+"""A landmark in view for longer is mapped from its latest frames: a car may stand at a light for an hour."""
+LANE_FLUSH_FRAMES = 150
+"""Lane tracklets do not end where a marker goes on: what they showed is mapped every so many frames."""
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one frame told."""
+
+    sign_tracklet: Int[Tensor, " d"]
+    """Tracklet of each sign detection of the frame."""
+    lane_tracklet: Int[Tensor, " l"]
+    """Tracklet of each lane detection of the frame."""
+    road: RoadEstimate
+    """The road under the car, one row."""
+    signs: Signs | None
+    """Signs whose tracklets ended: they are out of sight. `frame` counts from the drive's start."""
+    lanes: Lanes | None
+    """Lane pieces of the last stretch, when one was finished."""
+
+
+class SingleJourneyMapper:
+    """Maps a drive frame by frame, causally, with memory bounded by what is in sight.
+
+    Association is exactly that of the batch (`associate_signs`, `associate_lanes`); signs come out when they are out of
+    sight, lane pieces every stretch. `state_dict` and `load_state_dict` interrupt a drive and go on.
+    """
+
+    def __init__(self, rig: Rig, config: MapperConfig | None = None) -> None:
+        """Of a car with this rig; `config.road.method` is `causal` whatever the configuration smooths."""
+        config = (config or MapperConfig()).resolved()
+        if config.road.method == "smoothed":
+            config = replace(config, road=replace(config.road, method="causal"))
+        self.config = config
+        self.rig = rig
+        self._signs = SignAssociator(config.sign_association)
+        self._lanes = LaneAssociator(config.lane_association)
+        self._road = RoadTracker(rig, config.road)
+        self._next = 0
+        self._parts: list[Journey] = []
+        self._sign_labels: list[Tensor] = []
+        self._sign_shifts: list[Tensor] = []
+        self._lane_labels: list[Tensor] = []
+        self._roads: list[RoadEstimate] = []
+        self._mapped_lanes = 0
+
+    @property
+    def frames_held(self) -> int:
+        """Frames in memory: those since the oldest landmark that is still in sight came up."""
+        return len(self._parts)
+
+    @torch.no_grad()
+    def step(self, frame: Journey) -> StepResult:
+        """What a frame tells: a journey of one frame, as `frame_of` cuts it."""
+        if frame.frame_count != 1:
+            raise ValueError(f"expected a journey of one frame, found {frame.frame_count} frames")
+        pose, number = frame.T_world_camera[0], self._next
+        self._next += 1
+        sign_label, sign_shift = self._signs.step(number, pose, frame.signs)
+        lane_label = self._lanes.step(number, pose, frame.lanes, frame.lane_points, frame.rig)
+        road = self._road.advance(frame)
+        self._parts.append(frame)
+        self._sign_labels.append(sign_label)
+        self._sign_shifts.append(sign_shift)
+        self._lane_labels.append(lane_label)
+        self._roads.append(road)
+        signs = self._ended_signs()
+        lanes = self._finished_lanes()
+        self._forget()
+        return StepResult(sign_label, lane_label, road, signs, lanes)
+
+    @torch.no_grad()
+    def finish(self) -> tuple[Signs | None, Lanes | None]:
+        """What was still in sight when the drive ended."""
+        signs = self._map_signs(self._held_labels())
+        lanes = self._map_lanes()
+        self._parts, self._sign_labels, self._sign_shifts = [], [], []
+        self._lane_labels, self._roads = [], []
+        return signs, lanes
+
+    def state_dict(self) -> dict[str, object]:
+        """Everything that the next step needs."""
+        return {
+            "signs": self._signs.state_dict(),
+            "lanes": self._lanes.state_dict(),
+            "road": copy.deepcopy(self._road),
+            "next": self._next,
+            "held": (
+                list(self._parts),
+                list(self._sign_labels),
+                list(self._sign_shifts),
+                list(self._lane_labels),
+                list(self._roads),
+            ),
+            "mapped_lanes": self._mapped_lanes,
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on where another mapper with the same rig and configuration stopped."""
+        self._signs.load_state_dict(state["signs"])
+        self._lanes.load_state_dict(state["lanes"])
+        self._road = copy.deepcopy(state["road"])
+        self._next = state["next"]
+        parts, labels, shifts, lane_labels, roads = (list(held) for held in state["held"])
+        self._parts, self._sign_labels, self._sign_shifts = parts, labels, shifts
+        self._lane_labels, self._roads = lane_labels, roads
+        self._mapped_lanes = state["mapped_lanes"]
+
+    def _held_labels(self) -> set[int]:
+        return {label for part in self._sign_labels for label in part.tolist() if label >= 0}
+
+    def _ended_signs(self) -> Signs | None:
+        """Signs whose tracklets cannot be continued any more."""
+        oldest = self._next - 1 - self.config.sign_association.window_frames
+        if oldest < 0:
+            return None
+        index = len(self._parts) - 1 - self.config.sign_association.window_frames
+        if index < 0:
+            return None
+        open_labels = set(self._signs.active.label.tolist())
+        last_seen = {int(label) for label in self._sign_labels[index].tolist() if label >= 0}
+        seen_since = {
+            int(label) for part in self._sign_labels[index + 1 :] for label in part.tolist()
+        }
+        ended = (last_seen - seen_since) | (self._held_labels() - open_labels - seen_since)
+        return self._map_signs(ended)
+
+    def _map_signs(self, labels: set[int]) -> Signs | None:
+        if not labels:
+            return None
+        label, shift = torch.cat(self._sign_labels), torch.cat(self._sign_shifts)
+        journey = joined(self._parts)
+        wanted = torch.tensor(sorted(labels), dtype=torch.int64)
+        place = torch.searchsorted(wanted, label).clamp_max(len(wanted) - 1)
+        of_wanted = wanted[place] == label
+        own = torch.where(of_wanted, place, -1)
+        # A sign is mapped once: its detections are taken off.
+        self._sign_labels = list(
+            torch.where(of_wanted, -1, label).split([len(part) for part in self._sign_labels])
+        )
+        tracklets = Tracklets(own, len(wanted), shift)
+        signs, _ = triangulate_signs(journey, tracklets, self.config.sign_triangulation)
+        first = self._next - len(self._parts)
+        return replace(signs, frame=signs.frame + first, tracklet=wanted[signs.tracklet])
+
+    def _finished_lanes(self) -> Lanes | None:
+        if self._next - self._mapped_lanes < LANE_FLUSH_FRAMES:
+            return None
+        lanes = self._map_lanes()
+        self._mapped_lanes = self._next
+        return lanes
+
+    def _map_lanes(self) -> Lanes | None:
+        first = self._next - len(self._parts)
+        # Half a stretch of overlap, so that pieces meet.
+        start = max(self._mapped_lanes - LANE_FLUSH_FRAMES // 2 - first, 0)
+        parts = self._parts[start:]
+        if not parts:
+            return None
+        label = torch.cat(self._lane_labels[start:])
+        used, own = torch.unique(label, return_inverse=True)
+        road = concatenate(self._roads[start:])
+        lanes, _ = reconstruct_lanes(
+            joined(parts), Tracklets(own, len(used)), road, self.config.lane
+        )
+        return replace(lanes, frame=lanes.frame + first + start, tracklet=used[lanes.tracklet])
+
+    def _forget(self) -> None:
+        """Drops the frames that nothing in sight and no unfinished stretch needs."""
+        needed = len(self._parts)
+        for index, labels in enumerate(self._sign_labels):
+            if bool((labels >= 0).any()):
+                needed = index
+                break
+        first = self._next - len(self._parts)
+        stretch = max(self._mapped_lanes - LANE_FLUSH_FRAMES // 2 - first, 0)
+        drop = max(min(needed, stretch), len(self._parts) - MAX_OPEN_FRAMES, 0)
+        for held in (
+            self._parts,
+            self._sign_labels,
+            self._sign_shifts,
+            self._lane_labels,
+            self._roads,
+        ):
+            del held[:drop]
+
+
+def frame_of(journey: Journey, index: int) -> Journey:
+    """One frame of a journey as a journey of its own."""
+    signs = journey.signs[journey.signs.frame == index]
+    lane_rows = torch.nonzero(journey.lanes.frame == index)[:, 0]
+    lanes = journey.lanes[lane_rows]
+    new_row = torch.full((len(journey.lanes),), -1, device=lane_rows.device)
+    new_row[lane_rows] = torch.arange(len(lane_rows), device=lane_rows.device)
+    detection = new_row[journey.lane_points.detection]
+    points = journey.lane_points[detection >= 0]
+    at = slice(index, index + 1)
+    return replace(
+        journey,
+        frame_number=journey.frame_number[at],
+        t_ns=journey.t_ns[at],
+        T_world_camera=journey.T_world_camera[at],
+        sigma_position=None if journey.sigma_position is None else journey.sigma_position[at],
+        sigma_rotation=None if journey.sigma_rotation is None else journey.sigma_rotation[at],
+        signs=replace(signs, frame=torch.zeros_like(signs.frame)),
+        lanes=replace(lanes, frame=torch.zeros_like(lanes.frame)),
+        lane_points=replace(points, detection=detection[detection >= 0]),
+    )
+
+
+def joined(parts: list[Journey]) -> Journey:
+    """Successive parts of one journey as one."""
+    frames = torch.tensor([p.frame_count for p in parts])
+    frame_offset = (frames.cumsum(0) - frames).tolist()
+    lanes = torch.tensor([len(p.lanes) for p in parts])
+    lane_offset = (lanes.cumsum(0) - lanes).tolist()
+    every_sigma = [p.sigma_position for p in parts if p.sigma_position is not None]
+    every_turn = [p.sigma_rotation for p in parts if p.sigma_rotation is not None]
+
+    def shifted(table: SignDetections | LaneDetections, offset: int):
+        return replace(table, frame=table.frame + offset)
+
+    return replace(
+        parts[0],
+        frame_number=torch.cat([p.frame_number for p in parts]),
+        t_ns=torch.cat([p.t_ns for p in parts]),
+        T_world_camera=torch.cat([p.T_world_camera for p in parts]),
+        sigma_position=torch.cat(every_sigma) if len(every_sigma) == len(parts) else None,
+        sigma_rotation=torch.cat(every_turn) if len(every_turn) == len(parts) else None,
+        signs=concatenate(
+            [shifted(p.signs, at) for p, at in zip(parts, frame_offset, strict=True)]
+        ),
+        lanes=concatenate(
+            [shifted(p.lanes, at) for p, at in zip(parts, frame_offset, strict=True)]
+        ),
+        lane_points=concatenate(
+            [
+                replace(p.lane_points, detection=p.lane_points.detection + at)
+                for p, at in zip(parts, lane_offset, strict=True)
+            ]
+        ),
+    )

@@ -1,0 +1,303 @@
+"""Bundle adjustment of a simulated street whose associations are the true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from drives import signs_by_detection
+from torch import Tensor
+
+from crowdmap_torch.bundle import Bundle
+from crowdmap_torch.evaluation.signs import SignFigures, evaluate_signs
+from crowdmap_torch.geometry import camera, polygon, se3
+from crowdmap_torch.io.maps import read_map
+from crowdmap_torch.io.truth import JourneyTruth, Truth
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.observations import frame_offsets
+from crowdmap_torch.optim.levenberg_marquardt import LmConfig
+from crowdmap_torch.optim.linearize import term_costs
+from crowdmap_torch.stages import adjust
+from crowdmap_torch.stages.adjust import AdjustConfig
+from crowdmap_torch.tables import (
+    Association,
+    Dataset,
+    Journey,
+    Lanes,
+    RoadEstimate,
+    Signs,
+    Survey,
+)
+
+START_SIGMA_M = 0.1
+"""What the cluster heads are off by at the start, along each axis."""
+
+
+@dataclass(frozen=True)
+class Street:
+    """All that a bundle is built from."""
+
+    journeys: tuple[Journey, ...]
+    roads: tuple[RoadEstimate, ...]
+    signs: Signs
+    lanes: Lanes
+    associations: tuple[Association, ...]
+    drifts: tuple[Tensor, ...]
+
+    def bundle(self, *, left_out: tuple[int, ...] = (), config: AdjustConfig | None = None) -> Bundle:
+        return adjust.build(
+            self.journeys,
+            self.roads,
+            self.signs,
+            self.lanes,
+            self.associations,
+            self.drifts,
+            config or AdjustConfig(),
+            left_out=left_out,
+        )
+
+
+def true_association(truth: JourneyTruth, signs: Signs, row_of_sign: Tensor) -> Association:
+    """What each detection truly shows, and which of its corners is the sign's first."""
+    journey = truth.journey
+    true = signs_by_detection(truth)
+    row = torch.where(true >= 0, row_of_sign[true], -1)
+    row = torch.where(row_of_shape(signs, row) == journey.signs.shape, row, -1)
+    seen = torch.nonzero(row >= 0)[:, 0]
+    of = signs[row[seen]]
+    T = truth.T_world_camera[journey.signs.frame[seen]]
+    px, _ = camera.project(
+        journey.rig.camera, se3.transform(se3.inverse(T)[:, None], of.corners_world)
+    )
+    shift = torch.zeros_like(row)
+    shift[seen], _ = polygon.best_shift(
+        px, journey.signs.corners_px[seen], polygon.corner_count(of.shape)
+    )
+    return Association(row, shift, torch.full_like(journey.lanes.row, -1))
+
+
+def row_of_shape(signs: Signs, row: Tensor) -> Tensor:
+    return torch.where(row >= 0, signs.shape[row.clamp_min(0)], -1)
+
+
+@pytest.fixture(scope="module")
+def street(
+    tiny: Dataset, tiny_folder: Path, tiny_truth: Truth, tiny_result: MapResult
+) -> Street:
+    survey = read_map(tiny_folder / "survey").signs
+    shown = torch.cat([signs_by_detection(t) for t in tiny_truth.journeys])
+    often = torch.bincount(shown[shown >= 0], minlength=len(survey)) >= 20
+    true_signs = survey[often]
+    row_of_sign = torch.where(often, often.cumsum(0) - 1, -1)
+    noise = torch.randn(
+        len(true_signs), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    T = true_signs.T_world_sign.clone()
+    T[:, :3, 3] += START_SIGMA_M * noise
+    return Street(
+        journeys=tiny.journeys,
+        roads=tuple(m.road for m in tiny_result.journey_maps),
+        signs=replace(true_signs, T_world_sign=T),
+        lanes=tiny_result.first.lanes,
+        associations=tuple(
+            true_association(t, true_signs, row_of_sign) for t in tiny_truth.journeys
+        ),
+        drifts=tuple(torch.zeros(j.frame_count, 6, dtype=torch.float64) for j in tiny.journeys),
+    )
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """A bundle after its adjustment, and what was seen on the way."""
+
+    bundle: Bundle
+    reason: str
+    scales: Tensor
+    costs: list[float]
+
+
+@pytest.fixture(scope="module")
+def adjusted(street: Street) -> Adjusted:
+    bundle = street.bundle()
+    state = adjust.start(bundle)
+    backend = bundle.backend()
+    scales, costs = [bundle.scale.clone()], [float(state.cost)]
+    for _ in range(bundle.config.lm.max_iterations):
+        state, finished = adjust.adjust_step(bundle, state, backend)
+        scales.append(bundle.scale.clone())
+        costs.append(float(state.cost))
+        if finished:
+            break
+    return Adjusted(bundle, state.reasons[0], torch.stack(scales), costs)
+
+
+@pytest.fixture(scope="module")
+def figures(tiny_survey: Survey) -> Callable[[Signs], SignFigures]:
+    return lambda signs: evaluate_signs(signs, tiny_survey.signs)
+
+
+def test_the_relative_corner_error_falls_to_less_than_half(street: Street, adjusted: Adjusted, figures):
+    signs, _, _ = adjust.read_map(adjusted.bundle, street.signs, street.lanes, covariance=False)
+    before, after = figures(street.signs), figures(signs)
+    # 0.1 m along each axis at the start; what journeys with half a pixel of noise know is 2 to 4 cm.
+    assert before.relative.total.mean > 0.1
+    assert after.relative.total.mean < 0.5 * before.relative.total.mean
+    assert after.relative.total.mean < 0.06
+    assert after.recall == before.recall
+
+
+def test_the_adjustment_says_that_it_converged(adjusted: Adjusted):
+    assert adjusted.reason.startswith("converged")
+    assert len(adjusted.costs) < adjusted.bundle.config.lm.max_iterations
+
+
+def test_scales_never_grow_and_stay_above_their_least(adjusted: Adjusted):
+    config = adjusted.bundle.config
+    assert (adjusted.scales.diff(dim=0) <= 0).all()
+    least = torch.tensor([config.sign_sigma_px, config.lane_sigma_px], dtype=torch.float64)
+    assert (adjusted.scales >= least).all() and adjusted.scales.isfinite().all()
+    # The start is 0.1 m off, several pixels; in the end the detections' own noise is left.
+    assert adjusted.scales[0, 0] > 3 and adjusted.scales[-1, 0] < 1.0
+
+
+def test_adjust_is_the_same_loop(street: Street, adjusted: Adjusted):
+    bundle = street.bundle()
+    state = adjust.adjust(bundle)
+    assert float(state.cost) == pytest.approx(adjusted.costs[-1], rel=1e-9)
+    for name, value in bundle.values().items():
+        assert torch.allclose(value, adjusted.bundle.values()[name], atol=1e-9)
+
+
+def test_increments_are_zero_at_rest(street: Street, adjusted: Adjusted):
+    for bundle in (street.bundle(), adjusted.bundle):
+        assert {name for name, _ in bundle.named_parameters()} == {
+            f"delta_{name}" for name in bundle.names
+        }
+        for name, value in bundle.values().items():
+            assert not getattr(bundle, f"delta_{name}").any()
+            assert torch.allclose(value, getattr(bundle, f"base_{name}"), atol=1e-12)
+
+
+def test_a_bundle_goes_on_from_its_state_dict(street: Street, adjusted: Adjusted, tmp_path: Path):
+    torch.save(adjusted.bundle.state_dict(), tmp_path / "bundle.pt")
+    other = street.bundle()
+    other.load_state_dict(torch.load(tmp_path / "bundle.pt", weights_only=True))
+    for name, value in other.values().items():
+        assert torch.equal(value, adjusted.bundle.values()[name])
+    assert torch.equal(other.scale, adjusted.bundle.scale)
+    # Lanes are matched again: the cost is that of the adjusted bundle.
+    assert float(adjust.start(other).cost) == pytest.approx(adjusted.costs[-1], rel=1e-3)
+
+
+def test_a_torch_optimiser_on_the_increments_lowers_the_cost_and_stays_on_the_manifold(
+    street: Street,
+):
+    bundle = street.bundle()
+    bundle.refresh()
+    problem = bundle.problem()
+
+    def cost() -> Tensor:
+        return torch.stack([c.sum() for c in term_costs(problem, bundle.values()).values()]).sum()
+
+    optimiser = torch.optim.Adam(bundle.parameters(), lr=1e-3)
+    before = cost().item()
+    for _ in range(10):
+        optimiser.zero_grad()
+        cost().backward()
+        optimiser.step()
+    assert cost().item() < 0.9 * before
+    values = bundle.values()
+    eye = torch.eye(3, dtype=torch.float64)
+    for name in ("pose", "sign"):
+        R = values[name][:, :3, :3].detach()
+        assert (R @ R.mT - eye).abs().max() < 1e-12
+        assert (torch.linalg.det(R) > 0).all()
+        assert getattr(bundle, f"delta_{name}").abs().max() > 0
+    assert (values["size"] > 0).all()
+    bundle.fold({k: v.detach() for k, v in values.items()})
+    assert cost().item() < 0.9 * before and not any(p.any() for p in bundle.parameters())
+
+
+def test_covariances_are_symmetric_and_positive(street: Street, adjusted: Adjusted):
+    signs, lanes, shared = adjust.read_map(adjusted.bundle, street.signs, street.lanes)
+    assert torch.allclose(signs.covariance, signs.covariance.mT, atol=1e-9)
+    assert torch.equal(shared, shared.mT)
+    assert (torch.linalg.eigvalsh(signs.covariance) > 0).all()
+    assert (torch.linalg.eigvalsh(shared) >= 0).all()
+    # All share the journeys' biases, 0.3 m each and three of them: no place is better known than that.
+    sigma = signs.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    assert sigma.min() > 0.1 and sigma.max() < 0.6
+    assert (shared.diagonal() <= signs.covariance.diagonal(dim1=1, dim2=2).mean(0)).all()
+    assert lanes.control.sigma.isfinite().all()
+    assert lanes.control.sigma.min() > 0.05
+
+
+def test_refined_poses_are_the_bundles_where_it_has_them(street: Street, adjusted: Adjusted):
+    bundle = adjusted.bundle
+    poses = adjust.read_poses(bundle, street.journeys)
+    assert [len(p) for p in poses] == [j.frame_count for j in street.journeys]
+    assert torch.equal(torch.cat(poses)[bundle.frame], bundle.values()["pose"])
+
+
+def test_refined_poses_between_are_moved_like_their_neighbours(street: Street, adjusted: Adjusted):
+    # With three metres between frames most are not in the bundle.
+    config = replace(AdjustConfig(), frame_spacing_m=3.0, lm=LmConfig(max_iterations=8))
+    bundle = street.bundle(config=config)
+    adjust.adjust(bundle)
+    poses = adjust.read_poses(bundle, street.journeys)
+    for journey, of_all, of_few in zip(
+        street.journeys, adjust.read_poses(adjusted.bundle, street.journeys), poses, strict=True
+    ):
+        moved = (of_few - journey.T_world_camera)[:, :3, 3]
+        # White noise of frames is 2 cm and stays where a frame is not in the bundle; drift is slow.
+        assert moved.diff(dim=0).norm(dim=1).max() < 0.15
+        assert (of_few - of_all)[:, :3, 3].norm(dim=1).mean() < 0.1
+
+
+def test_journeys_left_out_have_no_say_and_keep_their_poses(street: Street):
+    bundle = street.bundle(left_out=(1,))
+    offsets = frame_offsets(street.journeys)
+    inside = (bundle.frame >= offsets[1]) & (bundle.frame < offsets[2])
+    assert not inside.any() and len(bundle.frame)
+    adjust.start(bundle)
+    poses = adjust.read_poses(bundle, street.journeys)
+    assert torch.equal(poses[1], street.journeys[1].T_world_camera)
+
+
+def test_nothing_observed_is_a_bundle_that_moves_nothing(street: Street):
+    none = torch.zeros(0, dtype=torch.int64)
+    signs = street.signs[none]
+    lanes = street.lanes.select(none)
+    blind = tuple(
+        replace(a, sign=torch.full_like(a.sign, -1)) for a in street.associations
+    )
+    empty = replace(street, signs=signs, lanes=lanes, associations=blind)
+    bundle = empty.bundle()
+    adjust.adjust(bundle)
+    after, lanes_after, shared = adjust.read_map(bundle, signs, lanes)
+    assert len(after) == len(lanes_after) == 0 and not shared.any()
+    for journey, poses in zip(
+        street.journeys, adjust.read_poses(bundle, street.journeys), strict=True
+    ):
+        assert torch.equal(poses, journey.T_world_camera)
+
+
+def test_signs_alone_and_lanes_alone_can_be_adjusted(street: Street):
+    few_steps = replace(AdjustConfig(), lm=LmConfig(max_iterations=3))
+    none = torch.zeros(0, dtype=torch.int64)
+    blind = tuple(
+        replace(a, sign=torch.full_like(a.sign, -1)) for a in street.associations
+    )
+    for part in (
+        replace(street, lanes=street.lanes.select(none)),
+        replace(street, signs=street.signs[none], associations=blind),
+    ):
+        bundle = part.bundle(config=few_steps)
+        state = adjust.adjust(bundle)
+        assert state.cost.isfinite().all()
+        signs, lanes, shared = adjust.read_map(bundle, part.signs, part.lanes)
+        assert (torch.linalg.eigvalsh(shared) >= -1e-12).all() and shared.any()
+        assert signs.covariance.isfinite().all() and lanes.control.sigma.isfinite().all()

@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+from drives import shuffled, turn_about_up, with_frames
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.geometry import se3, spline
+from crowdmap_torch.mapper import MapResult, build_map, certain_part, map_journeys
+from crowdmap_torch.tables import Dataset, HdMap, Journey
+
+CONFIG = MapperConfig()
+SAME_M = 3e-3
+"""Two ways of computing one map may stop their iterations at places that far apart [m].
+
+The solvers stop when the cost falls by less than 1e-4 of itself; the signs are known to some 3 cm.
+"""
+
+
+def rebuilt(dataset: Dataset, change: Callable[[Journey], Journey]) -> MapResult:
+    journeys = tuple(change(journey) for journey in dataset.journeys)
+    return build_map(replace(dataset, journeys=journeys), CONFIG)
+
+
+def sign_pairs(a: HdMap, b: HdMap) -> tuple[Tensor, Tensor]:
+    """Rows of the signs of two maps that lie nearest to each other."""
+    distance = torch.cdist(a.signs.center_world, b.signs.center_world)
+    return tuple(torch.as_tensor(rows) for rows in linear_sum_assignment(distance.numpy()))
+
+
+def largest_corner_distance(a: HdMap, b: HdMap) -> float:
+    """Between corner sets: of the same sign every corner has one nearest to it in the other map."""
+    one, other = sign_pairs(a, b)
+    distance = torch.cdist(a.signs.corners_world[one], b.signs.corners_world[other])
+    return float(torch.maximum(distance.amin(1), distance.amin(2)).max())
+
+
+def largest_lane_distance(a: HdMap, b: HdMap) -> float:
+    """From points of each map's lanes to the other's."""
+    points = [
+        spline.sample_flat(m.lanes.control.point_world, m.lanes.control_count, 0.1)[0]
+        for m in (a, b)
+    ]
+    distance = torch.cdist(*points)
+    return float(torch.maximum(distance.amin(0).max(), distance.amin(1).max()))
+
+
+def moved(hd_map: HdMap, T: Tensor) -> HdMap:
+    signs = replace(hd_map.signs, T_world_sign=T @ hd_map.signs.T_world_sign)
+    control = hd_map.lanes.control
+    control = replace(control, point_world=se3.transform(T, control.point_world))
+    return replace(hd_map, signs=signs, lanes=replace(hd_map.lanes, control=control))
+
+
+def test_the_map_shows_the_street(tiny_result: MapResult, tiny_survey):
+    hd_map = certain_part(tiny_result.hd_map, CONFIG.min_confidence)
+    assert len(hd_map.signs) >= 3 and len(hd_map.lanes) >= 3
+    distance = torch.cdist(hd_map.signs.center_world, tiny_survey.signs.center_world).amin(1)
+    # Three journeys with biases of 0.3 m: none of the means is a metre off.
+    assert distance.max() < 1.0
+    assert tiny_result.state.reasons[0].startswith("converged")
+
+
+def test_the_map_moves_with_the_world(tiny: Dataset, tiny_result: MapResult):
+    T = turn_about_up(0.7, (250.0, -120.0, 30.0))
+    # The module's sigmas are the same to the east and to the north: they turn with the world.
+    for journey in tiny.journeys:
+        assert journey.sigma_position is not None
+        assert torch.equal(journey.sigma_position[:, 0], journey.sigma_position[:, 1])
+    result = rebuilt(tiny, lambda j: replace(j, T_world_camera=T @ j.T_world_camera))
+    expected = moved(tiny_result.hd_map, T)
+    assert len(result.hd_map.signs) == len(expected.signs)
+    assert len(result.hd_map.lanes) == len(expected.lanes)
+    assert largest_corner_distance(result.hd_map, expected) < SAME_M
+    assert largest_lane_distance(result.hd_map, expected) < 0.1 + 10 * SAME_M
+    assert result.hd_map.sign_id == tiny_result.hd_map.sign_id
+    for a, b in zip(result.poses, tiny_result.poses, strict=True):
+        assert (a - T @ b)[:, :3, 3].norm(dim=1).max() < 10 * SAME_M
+
+
+def test_nothing_depends_on_the_order_of_rows(tiny: Dataset, tiny_result: MapResult, generator):
+    result = rebuilt(tiny, lambda journey: shuffled(journey, generator))
+    assert largest_corner_distance(result.hd_map, tiny_result.hd_map) < SAME_M
+    assert set(result.hd_map.sign_id) == set(tiny_result.hd_map.sign_id)
+    assert largest_lane_distance(result.hd_map, tiny_result.hd_map) < 0.1 + 10 * SAME_M
+    one, other = sign_pairs(result.hd_map, tiny_result.hd_map)
+    for column in ("shape", "type", "n_journeys", "n_observations", "first_seen_ns"):
+        a, b = (getattr(r.hd_map.signs, column) for r in (result, tiny_result))
+        assert torch.equal(a[one], b[other]), column
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two tables, or dataclasses of them, hold the same numbers to the last bit."""
+    if isinstance(a, Tensor):
+        return torch.allclose(a, b, rtol=0, atol=0, equal_nan=True)
+    if is_dataclass(a):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    return a == b
+
+
+def test_workers_give_what_one_process_gives(tiny: Dataset):
+    journeys: Sequence[Journey] = [
+        with_frames(j, torch.arange(0, 40, 2)) for j in tiny.journeys[:2]
+    ]
+    alone = map_journeys(journeys, CONFIG, workers=1)
+    together = map_journeys(journeys, CONFIG, workers=2)
+    assert any(len(m.signs) for m in alone) and any(len(m.lanes) for m in alone)
+    assert [m.signs.journey.unique().tolist() for m in together if len(m.signs)] == [
+        m.signs.journey.unique().tolist() for m in alone if len(m.signs)
+    ]
+    for a, b in zip(alone, together, strict=True):
+        assert same(a, b)
+
+
+def test_progress_is_told_every_journey_and_every_step(tiny: Dataset):
+    calls: list[tuple[str, int, int]] = []
+    journeys = tuple(with_frames(j, torch.arange(0, 60, 3)) for j in tiny.journeys[:1])
+    build_map(
+        replace(tiny, journeys=journeys),
+        CONFIG,
+        progress=lambda stage, done, total: calls.append((stage, done, total)),
+    )
+    assert calls[:2] == [("single journeys", 0, 1), ("single journeys", 1, 1)]
+    steps = [done for stage, done, _ in calls if stage == "bundle adjustment"]
+    assert steps == list(range(1, len(steps) + 1)) and steps
+
+
+def test_inputs_are_left_as_they_were(tiny: Dataset):
+    journey = with_frames(tiny.journeys[1], torch.arange(0, 60, 3))
+    kept = [
+        journey.T_world_camera.clone(),
+        journey.signs.corners_px.clone(),
+        journey.lane_points.ideal.clone(),
+    ]
+    build_map(replace(tiny, journeys=(journey,)), CONFIG)
+    now = [journey.T_world_camera, journey.signs.corners_px, journey.lane_points.ideal]
+    assert all(torch.equal(a, b) for a, b in zip(kept, now, strict=True))
+
+
+@pytest.mark.parametrize("method", ["joint", "paper2017"])
+def test_journeys_without_detections_give_a_map_of_nothing(tiny: Dataset, method: str):
+    none = torch.zeros(0, dtype=torch.int64)
+    journeys = tuple(
+        replace(j, signs=j.signs[none], lanes=j.lanes[none], lane_points=j.lane_points[none])
+        for j in tiny.journeys
+    )
+    result = build_map(replace(tiny, journeys=journeys), MapperConfig(method=method))
+    assert len(result.hd_map.signs) == len(result.hd_map.lanes) == 0
+    for journey, poses in zip(journeys, result.poses, strict=True):
+        assert torch.allclose(poses, journey.T_world_camera)

@@ -1,0 +1,106 @@
+"""A drive frame by frame: association equals the batch, memory stays bounded, a drive can be interrupted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.io.datasets import load_journey
+from crowdmap_torch.simulate.dataset import SimulationConfig, write_dataset
+from crowdmap_torch.simulate.worlds import PRESETS
+from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of, joined
+from crowdmap_torch.stages.associate import associate_signs
+from crowdmap_torch.stages.associate_lanes import associate_lanes
+from crowdmap_torch.stages.road import estimate_road
+from crowdmap_torch.stages.signs import triangulate_signs
+from crowdmap_torch.tables import concatenate
+
+FRAMES = 220
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """The first frames of a simulated street."""
+    out = tmp_path_factory.mktemp("drive") / "street"
+    config = SimulationConfig(world=PRESETS["street"], journeys=1, seed=3)
+    write_dataset(config, out)
+    (folder,) = (out / "journeys").iterdir()
+    journey, _ = load_journey(folder)
+    return joined([frame_of(journey, i) for i in range(min(FRAMES, journey.frame_count))])
+
+
+@pytest.fixture(scope="module")
+def stepped(drive):
+    mapper = SingleJourneyMapper(drive.rig)
+    held, results = [], []
+    for index in range(drive.frame_count):
+        results.append(mapper.step(frame_of(drive, index)))
+        held.append(mapper.frames_held)
+    return results, mapper.finish(), held
+
+
+def test_association_equals_the_batch(drive, stepped):
+    results, _, _ = stepped
+    config = MapperConfig()
+    signs = associate_signs(drive, config.sign_association)
+    order = torch.argsort(drive.signs.frame, stable=True)
+    assert torch.equal(torch.cat([r.sign_tracklet for r in results]), signs.label[order])
+    lanes = associate_lanes(drive, config.lane_association)
+    order = torch.argsort(drive.lanes.frame, stable=True)
+    assert torch.equal(torch.cat([r.lane_tracklet for r in results]), lanes.label[order])
+
+
+def test_the_road_equals_the_causal_batch(drive, stepped):
+    results, _, _ = stepped
+    config = replace(MapperConfig().road, method="causal")
+    batch = estimate_road(drive, config)
+    stepwise = concatenate([r.road for r in results])
+    torch.testing.assert_close(stepwise.normal_camera, batch.normal_camera, rtol=0, atol=1e-9)
+
+
+def test_every_sign_of_the_batch_comes_out_once(drive, stepped):
+    results, (last, _), _ = stepped
+    config = MapperConfig()
+    batch, _ = triangulate_signs(
+        drive, associate_signs(drive, config.sign_association), config.sign_triangulation
+    )
+    found = [r.signs for r in results if r.signs is not None]
+    found = concatenate(found + ([last] if last is not None else []))
+    assert len(found) >= len(batch)
+    distance = torch.cdist(batch.center_world, found.center_world).amin(1)
+    # The same detections give the same fit; a tracklet may have been rejoined in the batch alone.
+    assert float(distance.median()) < 1e-3
+
+
+def test_memory_holds_what_is_in_sight(stepped):
+    _, _, held = stepped
+    assert max(held) < FRAMES
+    assert len(set(held)) > 1
+
+
+def test_lanes_come_out_along_the_way(stepped):
+    results, (_, last), _ = stepped
+    assert any(r.lanes is not None and len(r.lanes) for r in results)
+    assert last is not None
+
+
+def test_an_interrupted_drive_goes_on(drive):
+    whole, first, second = (SingleJourneyMapper(drive.rig) for _ in range(3))
+    frames = [frame_of(drive, i) for i in range(60)]
+    expected = [whole.step(frame) for frame in frames]
+    for frame in frames[:30]:
+        first.step(frame)
+    second.load_state_dict(first.state_dict())
+    for frame, result in zip(frames[30:], expected[30:], strict=True):
+        again = second.step(frame)
+        assert torch.equal(again.sign_tracklet, result.sign_tracklet)
+        assert torch.equal(again.lane_tracklet, result.lane_tracklet)
+        torch.testing.assert_close(again.road.normal_camera, result.road.normal_camera)
+
+
+def test_two_frames_at_once_are_refused(drive):
+    with pytest.raises(ValueError, match="one frame"):
+        SingleJourneyMapper(drive.rig).step(drive)
