@@ -54,8 +54,7 @@ def make_journey(
         T_world_camera=T_world_camera,
         sigma_position=None,
         sigma_rotation=None,
-        signs=signs
-        or SignDetections(none, none, none, corners, corners, none, empty[:, 0], none),
+        signs=signs or SignDetections(none, none, none, corners, corners, none, empty[:, 0], none),
         lanes=lanes or LaneDetections(none, none, none, empty[:, 0]),
         lane_points=lane_points or LanePoints(none, empty, empty),
         dropped={},

@@ -60,9 +60,7 @@ def test_the_nearest_lane_is_found_within_the_gate(lanes: Lanes):
     points = [[10.0, 0.3, 0], [10, 3.1, 0.2], [40, 13.6, 0], [10, 1.75, 0], [10, -5, 0], [90, 0, 0]]
     lane, t = nearest_lanes(torch.tensor(points, dtype=torch.float64), lanes, gate=0.9)
     assert lane.tolist() == [0, 1, 2, -1, -1, -1]
-    at = spline_basis.evaluate_flat(
-        lanes.control.point_world, lanes.control_count, t[:3], lane[:3]
-    )
+    at = spline_basis.evaluate_flat(lanes.control.point_world, lanes.control_count, t[:3], lane[:3])
     # Samples are half a metre apart.
     assert ((at[:, 0] - torch.tensor([10.0, 10, 40])).abs() < 0.3).all()
 
@@ -185,7 +183,9 @@ def test_points_beyond_the_end_or_behind_the_camera_are_not_valid(lanes: Lanes):
     found = follow(start, rows, T.expand(3, 4, 4), coefficient, count)
     assert found.valid.tolist() == [False, True, False]
     behind = follow(start, rows, camera_at(60.0).expand(3, 4, 4), coefficient, count)
-    assert not behind.valid.any() and behind.t.isfinite().all() and behind.normal_px.isfinite().all()
+    assert (
+        not behind.valid.any() and behind.t.isfinite().all() and behind.normal_px.isfinite().all()
+    )
 
 
 def test_a_match_at_the_end_of_a_spline_does_not_come_and_go(lanes: Lanes):
@@ -234,9 +234,7 @@ def flat_road() -> RoadEstimate:
 
 
 def labels(journey: Journey, lanes: Lanes) -> list[int]:
-    return detection_lanes(
-        journey, flat_road(), journey.T_world_camera, lanes, gate=0.9
-    ).tolist()
+    return detection_lanes(journey, flat_road(), journey.T_world_camera, lanes, gate=0.9).tolist()
 
 
 def test_a_detection_is_of_the_lane_that_most_of_its_near_points_lie_on(lanes: Lanes):
@@ -244,7 +242,14 @@ def test_a_detection_is_of_the_lane_that_most_of_its_near_points_lie_on(lanes: L
     detections = [
         [[8.0, 0.1, 0], [9, 0.1, 0], [10, -0.1, 0], [11, 3.4, 0]],
         # Only the four nearest vote: what begins on the second marker is of the second.
-        [[25.0, 0, 0], [24, 0, 0], [23, 0, 0], [22, 0, 0], [21, 0, 0], *([x, 3.5, 0] for x in (6, 7, 8, 9))],
+        [
+            [25.0, 0, 0],
+            [24, 0, 0],
+            [23, 0, 0],
+            [22, 0, 0],
+            [21, 0, 0],
+            *([x, 3.5, 0] for x in (6, 7, 8, 9)),
+        ],
         [[8.0, 1.75, 0], [9, 1.75, 0]],
         [[50.0, 0, 0], [55, 0, 0]],
         [[8.0, 1.75, 0], [9, 3.6, 0]],
@@ -256,7 +261,8 @@ def test_a_detection_is_of_the_lane_that_most_of_its_near_points_lie_on(lanes: L
 def test_lanes_of_detections_do_not_depend_on_the_order_of_points(lanes: Lanes, generator):
     T = camera_at(0.0)
     lines = [
-        [[x, y + 0.5 * (x > 14), 0] for x in np.linspace(6, 20, 9).tolist()] for y in (0.0, 3.0, 6.9)
+        [[x, y + 0.5 * (x > 14), 0] for x in np.linspace(6, 20, 9).tolist()]
+        for y in (0.0, 3.0, 6.9)
     ]
     journey = detections_of(lines, T)
     points = journey.lane_points

@@ -28,6 +28,7 @@ LEVELS = {
     "mapper": 4,
     "report": 5,
     "run_folder": 5,
+    "single_journey": 4,
     "run_metrics": 5,
     "": 6,
 }

@@ -16,11 +16,8 @@ from crowdmap_torch.mapper import MapResult, build_map, certain_part, map_journe
 from crowdmap_torch.tables import Dataset, HdMap, Journey
 
 CONFIG = MapperConfig()
-SAME_M = 3e-3
-"""Two ways of computing one map may stop their iterations at places that far apart [m].
-
-The solvers stop when the cost falls by less than 1e-4 of itself; the signs are known to some 3 cm.
-"""
+SAME_M = 1e-3
+"""Two ways of computing one map may stop their iterations at places that far apart [m]."""
 
 
 def rebuilt(dataset: Dataset, change: Callable[[Journey], Journey]) -> MapResult:
@@ -41,14 +38,14 @@ def largest_corner_distance(a: HdMap, b: HdMap) -> float:
     return float(torch.maximum(distance.amin(1), distance.amin(2)).max())
 
 
-def largest_lane_distance(a: HdMap, b: HdMap) -> float:
-    """From points of each map's lanes to the other's."""
+def lane_distance(a: HdMap, b: HdMap) -> float:
+    """From the points of each map's lanes to the other's, for 95 % of them: a lane may end a metre earlier."""
     points = [
-        spline.sample_flat(m.lanes.control.point_world, m.lanes.control_count, 0.1)[0]
+        spline.sample_flat(m.lanes.control.point_world, m.lanes.control_count, 0.05)[0]
         for m in (a, b)
     ]
     distance = torch.cdist(*points)
-    return float(torch.maximum(distance.amin(0).max(), distance.amin(1).max()))
+    return float(torch.cat((distance.amin(0), distance.amin(1))).quantile(0.95))
 
 
 def moved(hd_map: HdMap, T: Tensor) -> HdMap:
@@ -67,8 +64,20 @@ def test_the_map_shows_the_street(tiny_result: MapResult, tiny_survey):
     assert tiny_result.state.reasons[0].startswith("converged")
 
 
-def test_the_map_moves_with_the_world(tiny: Dataset, tiny_result: MapResult):
-    T = turn_about_up(0.7, (250.0, -120.0, 30.0))
+@pytest.mark.parametrize(
+    ("angle", "tolerance_m"),
+    [
+        (0.0, SAME_M),
+        # Markers of many journeys are joined on a grid that does not turn with the world: their control points come to lie
+        # elsewhere along them, which moves a map of three journeys as a whole by half a centimetre.
+        (0.7, 0.01),
+    ],
+    ids=["shifted", "turned"],
+)
+def test_the_map_moves_with_the_world(
+    tiny: Dataset, tiny_result: MapResult, angle: float, tolerance_m: float
+):
+    T = turn_about_up(angle, (250.0, -120.0, 30.0))
     # The module's sigmas are the same to the east and to the north: they turn with the world.
     for journey in tiny.journeys:
         assert journey.sigma_position is not None
@@ -77,18 +86,20 @@ def test_the_map_moves_with_the_world(tiny: Dataset, tiny_result: MapResult):
     expected = moved(tiny_result.hd_map, T)
     assert len(result.hd_map.signs) == len(expected.signs)
     assert len(result.hd_map.lanes) == len(expected.lanes)
-    assert largest_corner_distance(result.hd_map, expected) < SAME_M
-    assert largest_lane_distance(result.hd_map, expected) < 0.1 + 10 * SAME_M
+    assert largest_corner_distance(result.hd_map, expected) < tolerance_m
+    # Samples are 5 cm apart.
+    assert lane_distance(result.hd_map, expected) < 0.03
     assert result.hd_map.sign_id == tiny_result.hd_map.sign_id
     for a, b in zip(result.poses, tiny_result.poses, strict=True):
-        assert (a - T @ b)[:, :3, 3].norm(dim=1).max() < 10 * SAME_M
+        assert (a - T @ b)[:, :3, 3].norm(dim=1).max() < 3 * tolerance_m
 
 
 def test_nothing_depends_on_the_order_of_rows(tiny: Dataset, tiny_result: MapResult, generator):
     result = rebuilt(tiny, lambda journey: shuffled(journey, generator))
     assert largest_corner_distance(result.hd_map, tiny_result.hd_map) < SAME_M
     assert set(result.hd_map.sign_id) == set(tiny_result.hd_map.sign_id)
-    assert largest_lane_distance(result.hd_map, tiny_result.hd_map) < 0.1 + 10 * SAME_M
+    # Samples are 5 cm apart.
+    assert lane_distance(result.hd_map, tiny_result.hd_map) < 0.03
     one, other = sign_pairs(result.hd_map, tiny_result.hd_map)
     for column in ("shape", "type", "n_journeys", "n_observations", "first_seen_ns"):
         a, b = (getattr(r.hd_map.signs, column) for r in (result, tiny_result))

@@ -159,7 +159,9 @@ def test_corners_at_the_truth_have_no_residual_wherever_detections_start(signs: 
     rig = make_rig(distortion)
     shift = torch.tensor([1, 2, 3, 0, 4, 7])
     journeys, associations = zip(
-        seen(signs, rig, metres(3, 2.0), shift), seen(signs, rig, metres(2, 4.0), shift), strict=True
+        seen(signs, rig, metres(3, 2.0), shift),
+        seen(signs, rig, metres(2, 4.0), shift),
+        strict=True,
     )
     error, row = corner_residuals(signs, journeys, associations)
     # Undistortion closes to well below a thousandth of a pixel.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 
+@runtime_checkable
 class Loss(Protocol):
     """A loss with `rho(0) = 0` and `rho'(0) = 1`; the cost of an observation is `rho(s) / 2`."""
 

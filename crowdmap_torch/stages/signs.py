@@ -52,9 +52,11 @@ class RejoinConfig:
     max_distance_m: float = 5.0
     """As are those further apart than this."""
     max_size_ratio: float = 1.5
-    """As are signs whose width or height differ by more, beyond what the frames leave open."""
+    """As are signs whose width or height differ by more; the square of it where one of them is vague."""
     min_facing: float = 0.5
-    """As are signs whose normals have a smaller scalar product."""
+    """As are signs whose normals have a smaller scalar product, unless one of them is vague."""
+    vague_sigma_m: float = 0.7
+    """A sign is vague if its centre has a larger standard deviation."""
     drift_m: float = 0.029
     """Drift of positions over one metre of travel; it grows with the square root of the way."""
     speed: float = 12.0
@@ -285,16 +287,16 @@ def _rejoin(
     offset = (centre[a] - centre[b])[..., None]
     distance_sq = (offset.mT @ torch.linalg.solve(covariance, offset))[:, 0, 0]
     facing = (fit.T_world_sign[a, :3, 2] * fit.T_world_sign[b, :3, 2]).sum(-1)
-    # A size is known no better than the depth along with which it was estimated.
-    depth_sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-    slack = 1 + depth_sigma / _closest_distance(views, fit)[a]
     ratio = torch.maximum(fit.size[a] / fit.size[b], fit.size[b] / fit.size[a]).amax(-1)
+    # Where the place is vague, the views were few and far: then size and normal are no better known.
+    sigma = torch.linalg.eigvalsh(fit.covariance)[:, -1].clamp_min(0).sqrt()
+    is_vague = torch.maximum(sigma[a], sigma[b]) > rules.vague_sigma_m
     agrees = (
         (distance_sq < rules.max_distance**2)
         & (gap_s < rules.max_gap_s)
         & (shape[a] == shape[b])
-        & (facing > rules.min_facing)
-        & (ratio < rules.max_size_ratio * slack)
+        & ((facing > rules.min_facing) | is_vague)
+        & (ratio < torch.where(is_vague, rules.max_size_ratio**2, rules.max_size_ratio))
     )
     candidates = pairs[agrees][torch.argsort(distance_sq[agrees], stable=True)]
     return _exclusive_groups(views, candidates, n, rules.max_common_share)

@@ -158,9 +158,7 @@ def test_each_journey_has_its_refined_poses_landmarks_and_road(
 def test_associations_name_a_landmark_or_none_for_every_row(run: Path, tiny_folder: Path):
     table = pq.read_table(run / "associations.parquet")
     assert table.column_names == ["journey_id", "kind", "row", "landmark_id"]
-    rows = sorted(
-        zip(*(table[k].to_pylist() for k in ("journey_id", "kind", "row")), strict=True)
-    )
+    rows = sorted(zip(*(table[k].to_pylist() for k in ("journey_id", "kind", "row")), strict=True))
     expected = [
         (journey.name, kind, row)
         for journey in journeys_of(tiny_folder)
@@ -256,9 +254,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
     assert (resumed.signs.corners_world - whole.signs.corners_world).abs().max() < 5e-3
 
 
-def test_overwrite_replaces_a_run(
-    optimize, quick, run: Path, copy: Path, tmp_path: Path
-):
+def test_overwrite_replaces_a_run(optimize, quick, run: Path, copy: Path, tmp_path: Path):
     out = Path(shutil.copytree(run, tmp_path / "run"))
     shutil.rmtree(journeys_of(copy)[-1])
     shutil.rmtree(copy / "survey")

@@ -47,7 +47,9 @@ class Street:
     associations: tuple[Association, ...]
     drifts: tuple[Tensor, ...]
 
-    def bundle(self, *, left_out: tuple[int, ...] = (), config: AdjustConfig | None = None) -> Bundle:
+    def bundle(
+        self, *, left_out: tuple[int, ...] = (), config: AdjustConfig | None = None
+    ) -> Bundle:
         return adjust.build(
             self.journeys,
             self.roads,
@@ -84,9 +86,7 @@ def row_of_shape(signs: Signs, row: Tensor) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def street(
-    tiny: Dataset, tiny_folder: Path, tiny_truth: Truth, tiny_result: MapResult
-) -> Street:
+def street(tiny: Dataset, tiny_folder: Path, tiny_truth: Truth, tiny_result: MapResult) -> Street:
     survey = read_map(tiny_folder / "survey").signs
     shown = torch.cat([signs_by_detection(t) for t in tiny_truth.journeys])
     often = torch.bincount(shown[shown >= 0], minlength=len(survey)) >= 20
@@ -139,7 +139,9 @@ def figures(tiny_survey: Survey) -> Callable[[Signs], SignFigures]:
     return lambda signs: evaluate_signs(signs, tiny_survey.signs)
 
 
-def test_the_relative_corner_error_falls_to_less_than_half(street: Street, adjusted: Adjusted, figures):
+def test_the_relative_corner_error_falls_to_less_than_half(
+    street: Street, adjusted: Adjusted, figures
+):
     signs, _, _ = adjust.read_map(adjusted.bundle, street.signs, street.lanes, covariance=False)
     before, after = figures(street.signs), figures(signs)
     # 0.1 m along each axis at the start; what journeys with half a pixel of noise know is 2 to 4 cm.
@@ -271,9 +273,7 @@ def test_nothing_observed_is_a_bundle_that_moves_nothing(street: Street):
     none = torch.zeros(0, dtype=torch.int64)
     signs = street.signs[none]
     lanes = street.lanes.select(none)
-    blind = tuple(
-        replace(a, sign=torch.full_like(a.sign, -1)) for a in street.associations
-    )
+    blind = tuple(replace(a, sign=torch.full_like(a.sign, -1)) for a in street.associations)
     empty = replace(street, signs=signs, lanes=lanes, associations=blind)
     bundle = empty.bundle()
     adjust.adjust(bundle)
@@ -288,9 +288,7 @@ def test_nothing_observed_is_a_bundle_that_moves_nothing(street: Street):
 def test_signs_alone_and_lanes_alone_can_be_adjusted(street: Street):
     few_steps = replace(AdjustConfig(), lm=LmConfig(max_iterations=3))
     none = torch.zeros(0, dtype=torch.int64)
-    blind = tuple(
-        replace(a, sign=torch.full_like(a.sign, -1)) for a in street.associations
-    )
+    blind = tuple(replace(a, sign=torch.full_like(a.sign, -1)) for a in street.associations)
     for part in (
         replace(street, lanes=street.lanes.select(none)),
         replace(street, signs=street.signs[none], associations=blind),

@@ -88,7 +88,9 @@ def test_a_car_that_stands_sees_the_same_markers_all_the_time(
     # White noise of positions and rotations: 1.5 cm and 0.02 degrees.
     noise = noise * torch.tensor([0.015] * 3 + [3.5e-4] * 3, dtype=torch.float64)
     T = se3.retract(standing.T_world_camera, noise)
-    label = associate_lanes(replace(standing, T_world_camera=T), LaneAssociationConfig(method=method)).label
+    label = associate_lanes(
+        replace(standing, T_world_camera=T), LaneAssociationConfig(method=method)
+    ).label
     per_frame = label.reshape(30, -1)
     assert (per_frame == per_frame[0]).all()
     assert len(per_frame[0].unique()) == per_frame.shape[1]
