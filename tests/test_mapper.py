@@ -28,7 +28,8 @@ def rebuilt(dataset: Dataset, change: Callable[[Journey], Journey]) -> MapResult
 def sign_pairs(a: HdMap, b: HdMap) -> tuple[Tensor, Tensor]:
     """Rows of the signs of two maps that lie nearest to each other."""
     distance = torch.cdist(a.signs.center_world, b.signs.center_world)
-    return tuple(torch.as_tensor(rows) for rows in linear_sum_assignment(distance.numpy()))
+    one, other = linear_sum_assignment(distance.numpy())
+    return torch.as_tensor(one), torch.as_tensor(other)
 
 
 def largest_corner_distance(a: HdMap, b: HdMap) -> float:
@@ -40,11 +41,11 @@ def largest_corner_distance(a: HdMap, b: HdMap) -> float:
 
 def lane_distance(a: HdMap, b: HdMap) -> float:
     """From the points of each map's lanes to the other's, for 95 % of them: a lane may end a metre earlier."""
-    points = [
+    one, other = (
         spline.sample_flat(m.lanes.control.point_world, m.lanes.control_count, 0.05)[0]
         for m in (a, b)
-    ]
-    distance = torch.cdist(*points)
+    )
+    distance = torch.cdist(one, other)
     return float(torch.cat((distance.amin(0), distance.amin(1))).quantile(0.95))
 
 
@@ -68,8 +69,8 @@ def test_the_map_shows_the_street(tiny_result: MapResult, tiny_survey):
     ("angle", "tolerance_m"),
     [
         (0.0, SAME_M),
-        # Markers of many journeys are joined on a grid that does not turn with the world: their control points come to lie
-        # elsewhere along them, which moves a map of three journeys as a whole by half a centimetre.
+        # Markers of many journeys are joined on a grid that does not turn with the world: their control
+        # points lie elsewhere along them, which moves the map of three journeys by half a centimetre.
         (0.7, 0.01),
     ],
     ids=["shifted", "turned"],

@@ -17,7 +17,7 @@ def copy_survey(tiny_folder: Path, tmp_path: Path) -> Path:
 
 def test_a_folder_with_something_in_it_is_refused(tmp_path: Path):
     (tmp_path / "old").touch()
-    with pytest.raises(ValueError, match="exists already; give --overwrite .* or --resume"):
+    with pytest.raises(ValueError, match=r"exists already; give --overwrite .* or --resume"):
         RunFolder(tmp_path)
     RunFolder(tmp_path, overwrite=True)
     RunFolder(tmp_path, resume=True)
