@@ -67,7 +67,9 @@ def _last_write(
     position = torch.full_like(target, -1).scatter_reduce(
         0, index, torch.arange(len(index), device=index.device), "amax"
     )
-    return torch.where(position >= 0, value[position.clamp_min(0)] if len(value) else target, target)
+    return torch.where(
+        position >= 0, value[position.clamp_min(0)] if len(value) else target, target
+    )
 
 
 def _name(journeys: Sequence[Journey], kind: str, found: tuple[int, int]) -> str:

@@ -163,6 +163,7 @@ def fit_signs(
         drift = state.values["drift"]
         whitened = _whitened(problem, state.values, shape, views)
         pose_error = _pose_error(whitened, noise, shape, views, config)
+    assert problem is not None and state is not None and whitened is not None
     return _read(problem, state, _mean_square(whitened, shape, views))
 
 
@@ -353,9 +354,7 @@ def _with_drift(
 def _by_corners(views: SignViews, shape: Int[Tensor, " n"]) -> list[tuple[str, Tensor, int]]:
     """Name of the term, rows of the views and number of corners, for each number of corners that occurs."""
     count = polygon.corner_count(shape)[views.sign]
-    return [
-        (f"corners_{c}", (count == c).nonzero()[:, 0], c) for c in count.unique().tolist()
-    ]
+    return [(f"corners_{c}", (count == c).nonzero()[:, 0], c) for c in count.unique().tolist()]
 
 
 def _noise(
@@ -422,8 +421,8 @@ def _corner_errors(
         template.flatten(0, 1),
         observation.flatten(0, 1),
     )
-    jacobians = tuple(J.reshape(m, 2 * c, -1) for J in (by_pose, by_sign, by_size))
-    return error.reshape(m, 2 * c), jacobians
+    by_pose, by_sign, by_size = (J.reshape(m, 2 * c, -1) for J in (by_pose, by_sign, by_size))
+    return error.reshape(m, 2 * c), (by_pose, by_sign, by_size)
 
 
 def _distance(views: SignViews, start: SignStart) -> Float[Tensor, " m"]:
@@ -463,9 +462,7 @@ def _whitened(
     return result
 
 
-def _read(
-    problem: Problem, state: lm.LmState, error_sq: Float[Tensor, " m"]
-) -> SignFit:
+def _read(problem: Problem, state: lm.LmState, error_sq: Float[Tensor, " m"]) -> SignFit:
     normal = DenseBackend().assemble(problem, state.values)
     covariance = normal.covariance()
     first = normal.where.offset["sign"]

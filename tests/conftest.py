@@ -5,10 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 from jaxtyping import install_import_hook
+
+if TYPE_CHECKING:
+    from crowdmap_torch.io.truth import Truth
+    from crowdmap_torch.mapper import MapResult
+    from crowdmap_torch.tables import Dataset, Survey
 
 if "OMP_NUM_THREADS" not in os.environ:
     # The tests' tensors are small: threads only wait for one another.
@@ -17,16 +23,6 @@ if "OMP_NUM_THREADS" not in os.environ:
 if os.environ.get("CROWDMAP_CHECK_SHAPES"):
     # Every jaxtyping annotation of the package is checked at run time: slower, and worth a run now and then.
     install_import_hook("crowdmap_torch", "shape_checks.checked")
-
-# Imported after the hook, which sees only what is imported behind it.
-from drives import write_tiny
-
-from crowdmap_torch import mapper
-from crowdmap_torch.config import MapperConfig
-from crowdmap_torch.io.datasets import load_dataset
-from crowdmap_torch.io.surveys import read_survey
-from crowdmap_torch.io.truth import Truth, read_truth
-from crowdmap_torch.tables import Dataset, Survey
 
 ROOT = Path(__file__).parent.parent
 
@@ -55,31 +51,45 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
+# The package is imported where it is used: behind the hook above, and not by tests of a single piece of it.
+
+
 @pytest.fixture(scope="session")
 def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated dataset of three short journeys on disk; tests that change it copy it first."""
+    from drives import write_tiny
+
     return write_tiny(tmp_path_factory.mktemp("tiny") / "dataset")
 
 
 @pytest.fixture(scope="session")
 def tiny(tiny_folder: Path) -> Dataset:
     """The same dataset, loaded."""
+    from crowdmap_torch.io.datasets import load_dataset
+
     return load_dataset(tiny_folder)
 
 
 @pytest.fixture(scope="session")
 def tiny_survey(tiny_folder: Path) -> Survey:
     """Its survey."""
+    from crowdmap_torch.io.surveys import read_survey
+
     return read_survey(tiny_folder / "survey")
 
 
 @pytest.fixture(scope="session")
 def tiny_truth(tiny_folder: Path, tiny: Dataset, tiny_survey: Survey) -> Truth:
     """The truth of its journeys."""
+    from crowdmap_torch.io.truth import read_truth
+
     return read_truth(tiny_folder / "survey", tiny_survey, tiny.journeys)
 
 
 @pytest.fixture(scope="session")
-def tiny_result(tiny: Dataset) -> mapper.MapResult:
+def tiny_result(tiny: Dataset) -> MapResult:
     """Its map with the default configuration."""
-    return mapper.build_map(tiny, MapperConfig())
+    from crowdmap_torch.config import MapperConfig
+    from crowdmap_torch.mapper import build_map
+
+    return build_map(tiny, MapperConfig())

@@ -131,8 +131,9 @@ def _load_journeys(
     """The journeys in use, and a note for each that was not listed and cannot be read."""
     there = sorted(p.name for p in (survey_folder / "truth").iterdir() if p.is_dir())
     listed = hd_map.provenance.get("journeys")
-    is_list = isinstance(listed, list) and all(isinstance(name, str) for name in listed)
-    wanted = set(listed) if is_list else set(there)
+    wanted = set(there)
+    if isinstance(listed, list) and all(isinstance(name, str) for name in listed):
+        wanted = set(listed)
     missing = sorted(wanted - set(there))
     if missing:
         raise InputError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,6 +35,7 @@ class Step:
     """Length of the step in tangent units."""
 
 
+@runtime_checkable
 class NormalEquations(Protocol):
     """The quadratic model of the cost around a point."""
 
@@ -53,6 +54,7 @@ class NormalEquations(Protocol):
         ...
 
 
+@runtime_checkable
 class Backend(Protocol):
     """A way to assemble and solve normal equations."""
 

@@ -149,7 +149,12 @@ def sign_sights(
     corners = detections.corners_ideal
     low, high = corners.amin(1), corners.amax(1)
     box = torch.stack(
-        (low, torch.stack((high[:, 0], low[:, 1]), -1), high, torch.stack((low[:, 0], high[:, 1]), -1)),
+        (
+            low,
+            torch.stack((high[:, 0], low[:, 1]), -1),
+            high,
+            torch.stack((low[:, 0], high[:, 1]), -1),
+        ),
         dim=1,
     )
     extent_px = detections.corners_px.amax(1) - detections.corners_px.amin(1)
@@ -271,7 +276,7 @@ class SignAssociator:
         silent_for = sights.frame[rows[0]] - sights.frame[old.last]
         old = old[silent_for <= self.config.window_frames]
         sighting, variance = sights.sighting[rows], sights.variance[rows]
-        prediction = self._predict(old, sights, rows[0])
+        prediction = self._predict(old, sights, int(rows[0]))
         epipolar_px2 = pair_costs(old.last[:, None], rows[None])
         cost, gate = self._costs(old, sights, rows, prediction, epipolar_px2)
         row, column = match_arrays(cost, gate)

@@ -385,9 +385,7 @@ def _fates(
     return fate
 
 
-def _parallax(
-    views: SignViews, fit: SignFit, counts: Bool[Tensor, " m"]
-) -> Float[Tensor, " n"]:
+def _parallax(views: SignViews, fit: SignFit, counts: Bool[Tensor, " m"]) -> Float[Tensor, " n"]:
     """Largest angle between the closest view's ray to a sign and the rays of the views that count [rad]."""
     towards = views.p_world_camera - fit.T_world_sign[views.sign, :3, 3]
     ray = torch.nn.functional.normalize(towards, dim=-1)

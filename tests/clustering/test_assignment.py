@@ -50,10 +50,10 @@ def test_empty_sides_match_nothing(shape):
 def test_window_pairs_are_all_pairs_in_the_window(chunk):
     time = torch.tensor([0, 0, 1, 4, 4, 5, 9, 12, 13])
     pairs = window_pairs(time, 3)
-    listed = [(int(a), int(b)) for ea, la in pairs.chunks(chunk) for a, b in zip(ea, la, strict=True)]
-    expected = [
-        (a, b) for b in range(9) for a in range(9) if 1 <= int(time[b] - time[a]) <= 3
+    listed = [
+        (int(a), int(b)) for ea, la in pairs.chunks(chunk) for a, b in zip(ea, la, strict=True)
     ]
+    expected = [(a, b) for b in range(9) for a in range(9) if 1 <= int(time[b] - time[a]) <= 3]
     assert listed == expected
     for number, (a, b) in enumerate(listed):
         assert int(pairs.index(torch.tensor(a), torch.tensor(b))) == number

@@ -146,7 +146,10 @@ def test_a_block_of_the_chain_may_carry_several_leaves():
     drift_chain = chain[begins]
     link = torch.nonzero(drift_chain[1:] == drift_chain[:-1])[:, 0]
     bound = CostTerm(
-        difference, (("pose", torch.arange(n)), ("drift", carrier)), (), torch.full((n,), 9.0).double()
+        difference,
+        (("pose", torch.arange(n)), ("drift", carrier)),
+        (),
+        torch.full((n,), 9.0).double(),
     )
     terms = {
         **{name: term for name, term in built.terms.items() if name != "odometry"},
