@@ -81,8 +81,6 @@ class SignViews(Rows):
     sign: Int[Tensor, " m"]
     """Row of the sign that each detection shows."""
     frame: Int[Tensor, " m"]
-    t_s: Float[Tensor, " m"]
-    """Time since the journey began [s]."""
     corners_px: Float[Tensor, "m 8 2"]
     corners_ideal: Float[Tensor, "m 8 2"]
     observation: Float[Tensor, "m 8 3 3"]

@@ -72,7 +72,7 @@ def drive_past(
 ) -> SignDrive:
     """Every sign in every frame that has all of it in the image, outlines beginning at any corner, rows in any order."""
     generator = torch.Generator().manual_seed(seed)
-    n, frames = len(T_world_sign), len(poses)
+    n = len(T_world_sign)
     codes = torch.full((n,), polygon.RECTANGLE) if shape is None else torch.tensor(shape)
     sizes = torch.tensor(size, dtype=F64).expand(n, 2)
     corners = se3.transform(T_world_sign[:, None], polygon.corners(codes, sizes))

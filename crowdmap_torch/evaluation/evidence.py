@@ -131,9 +131,9 @@ def _load_journeys(
     """The journeys in use, and a note for each that was not listed and cannot be read."""
     there = sorted(p.name for p in (survey_folder / "truth").iterdir() if p.is_dir())
     listed = hd_map.provenance.get("journeys")
-    wanted = set(there)
-    if isinstance(listed, list) and all(isinstance(name, str) for name in listed):
-        wanted = set(listed)
+    names = listed if isinstance(listed, list) else []
+    is_list = isinstance(listed, list) and all(isinstance(name, str) for name in names)
+    wanted = set(names) if is_list else set(there)
     missing = sorted(wanted - set(there))
     if missing:
         raise InputError(

@@ -55,8 +55,8 @@ class SignAssociationConfig:
     shape_penalty: float = 6.0
     """Added to the cost where a detection's shape is not the tracklet's shape by vote."""
     young_penalty: float = 4.0
-    """Added to the cost of a tracklet with one measurement, half of it with two, and so on: of two tracklets of one sign, one
-    begun by a second detection in a frame, the older goes on."""
+    """Added to the cost of a tracklet with one measurement, half of it with two, and so on: of two tracklets of one sign,
+    one begun by a second detection in a frame, the older goes on."""
     track_bonus: float = 2.0
     """Taken off where the perception module's track number agrees: a hint, which may be wrong."""
     sigma_px: float = 1.0

@@ -137,7 +137,8 @@ def triangulate_signs(
     views = _views(journey, tracklets, rows, sign)
     fit, scale = _fit(views, shape[label], config)
 
-    group = _rejoin(views, fit, shape[label], config)
+    t_s = (journey.t_ns - journey.t_ns[0]).to(journey.T_world_camera) * 1e-9
+    group = _rejoin(views, t_s[views.frame], fit, shape[label], config.rejoin)
     joined = group != torch.arange(len(label), device=group.device)
     if bool(joined.any()):
         reason[label[joined]] = REJOINED
@@ -189,11 +190,9 @@ def _views(
     shift = tracklets.shift[rows]
     px = polygon.roll(detections.corners_px, shift, count)
     ideal = polygon.roll(detections.corners_ideal, shift, count)
-    since_start = journey.t_ns - journey.t_ns[:1]
     return SignViews(
         sign=sign,
         frame=detections.frame,
-        t_s=since_start[detections.frame].to(px) * 1e-9,
         corners_px=px,
         corners_ideal=ideal,
         observation=camera.observation_matrix(journey.rig.camera, px, ideal),
@@ -270,16 +269,19 @@ def _refit(
 
 
 def _rejoin(
-    views: SignViews, fit: SignFit, shape: Int[Tensor, " n"], config: SignTriangulationConfig
+    views: SignViews,
+    t_s: Float[Tensor, " m"],
+    fit: SignFit,
+    shape: Int[Tensor, " n"],
+    rules: RejoinConfig,
 ) -> Int[Tensor, " n"]:
     """For each tracklet the first of those that show the same sign: itself, unless geometry says otherwise."""
-    rules = config.rejoin
     n = len(shape)
     centre = fit.T_world_sign[:, :3, 3]
     pairs = near_pairs(centre, radius=rules.max_distance_m, count=8)
     a, b = pairs.unbind(-1)
-    begin = torch.full_like(fit.cost, torch.inf).scatter_reduce(0, views.sign, views.t_s, "amin")
-    end = torch.full_like(fit.cost, -torch.inf).scatter_reduce(0, views.sign, views.t_s, "amax")
+    begin = torch.full_like(fit.cost, torch.inf).scatter_reduce(0, views.sign, t_s, "amin")
+    end = torch.full_like(fit.cost, -torch.inf).scatter_reduce(0, views.sign, t_s, "amax")
     gap_s = torch.maximum(begin[a] - end[b], begin[b] - end[a]).clamp_min(0)
     drift = rules.drift_m * (gap_s * rules.speed + 1).sqrt()
     eye = torch.eye(3, dtype=drift.dtype, device=drift.device)
