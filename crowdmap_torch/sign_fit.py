@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch import residuals
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.linear import DenseBackend
@@ -29,6 +28,14 @@ from crowdmap_torch.pose_drift import (
     drift_terms,
     place_knots,
     signed_distance,
+)
+from crowdmap_torch.sign_view import (
+    corner_errors,
+    drifting_sign_view,
+    drifting_sign_view_jacobian,
+    sign_habit,
+    sign_view,
+    sign_view_jacobian,
 )
 from crowdmap_torch.tables import Rows
 
@@ -141,7 +148,7 @@ def fit_signs(
     second round: around zero instead, views that are off to the side would make the sign seem further away than it
     is.
     """
-    away = (views.p_world_camera - start.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
+    away = distance_away(views, start)
     distance = signed_distance(views.p_world_camera, away, views.frame, views.sign)
     knots = place_knots(distance, views.sign, config.drift)
     drift = start.size.new_zeros(len(knots.landmark), 3)
@@ -183,6 +190,11 @@ def fit_signs_coarsely(
     return _read(problem, state, _mean_square(whitened, shape, views))
 
 
+def distance_away(views: SignViews, fit: SignFit | SignStart) -> Float[Tensor, " m"]:
+    """Distance of each view from its sign [m]."""
+    return (views.p_world_camera - fit.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
+
+
 def robust_noise_scale(
     error_sq: Float[Tensor, " m"], sign: Int[Tensor, " m"], count: int, most: float
 ) -> Float[Tensor, " count"]:
@@ -192,96 +204,6 @@ def robust_noise_scale(
     number = torch.bincount(sign, minlength=count)
     middle = number.cumsum(0) - number + number.div(2, rounding_mode="floor")
     return error_sq[order][middle].sqrt().clamp(1.0, most)
-
-
-def sign_view(
-    T_world_sign: Float[Tensor, "4 4"],
-    size: Float[Tensor, " 2"],
-    T_world_camera: Float[Tensor, "4 4"],
-    template: Float[Tensor, "c 2"],
-    observation: Float[Tensor, "c 3 3"],
-    expected: Float[Tensor, " e"],
-    whitening: Float[Tensor, "e e"],
-) -> Float[Tensor, " e"]:
-    """Whitened pixel errors of all corners of one detection, beyond those expected of the pose's own error (IV-B)."""
-    error = torch.func.vmap(residuals.sign_reprojection, in_dims=(None, None, None, 0, 0))(
-        T_world_camera, T_world_sign, size, template, observation
-    )
-    return whitening @ (error.reshape(-1) - expected)
-
-
-def drifting_sign_view(
-    T_world_sign: Float[Tensor, "4 4"],
-    size: Float[Tensor, " 2"],
-    before: Float[Tensor, " 3"],
-    after: Float[Tensor, " 3"],
-    T_world_camera: Float[Tensor, "4 4"],
-    template: Float[Tensor, "c 2"],
-    observation: Float[Tensor, "c 3 3"],
-    expected: Float[Tensor, " e"],
-    whitening: Float[Tensor, "e e"],
-    share: Float[Tensor, ""],
-) -> Float[Tensor, " e"]:
-    """`sign_view` from a pose whose position is off by the interpolation of two knots."""
-    moved = se3.make(
-        T_world_camera[:3, :3], T_world_camera[:3, 3] + (1 - share) * before + share * after
-    )
-    return sign_view(T_world_sign, size, moved, template, observation, expected, whitening)
-
-
-def sign_view_jacobian(
-    T_world_sign: Float[Tensor, "m 4 4"],
-    size: Float[Tensor, "m 2"],
-    T_world_camera: Float[Tensor, "m 4 4"],
-    template: Float[Tensor, "m c 2"],
-    observation: Float[Tensor, "m c 3 3"],
-    expected: Float[Tensor, "m e"],
-    whitening: Float[Tensor, "m e e"],
-) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor]]:
-    """`sign_view` and its Jacobians by sign pose and relative size."""
-    error, (_, by_sign, by_size) = _corner_errors(
-        T_world_camera, T_world_sign, size, template, observation
-    )
-    whitened = (whitening @ (error - expected)[..., None])[..., 0]
-    return whitened, (whitening @ by_sign, whitening @ by_size)
-
-
-def drifting_sign_view_jacobian(
-    T_world_sign: Float[Tensor, "m 4 4"],
-    size: Float[Tensor, "m 2"],
-    before: Float[Tensor, "m 3"],
-    after: Float[Tensor, "m 3"],
-    T_world_camera: Float[Tensor, "m 4 4"],
-    template: Float[Tensor, "m c 2"],
-    observation: Float[Tensor, "m c 3 3"],
-    expected: Float[Tensor, "m e"],
-    whitening: Float[Tensor, "m e e"],
-    share: Float[Tensor, " m"],
-) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """`drifting_sign_view` and its Jacobians by sign pose, relative size and the two knots."""
-    a = share[:, None]
-    p = T_world_camera[:, :3, 3] + (1 - a) * before + a * after
-    moved = se3.make(T_world_camera[:, :3, :3], p)
-    whitened, (by_sign, by_size) = sign_view_jacobian(
-        T_world_sign, size, moved, template, observation, expected, whitening
-    )
-    # A camera that moves one way sees the sign move the other way.
-    by_drift = -by_sign[..., :3]
-    a = a[..., None]
-    return whitened, (by_sign, by_size, (1 - a) * by_drift, a * by_drift)
-
-
-def sign_habit(
-    T_world_sign: Float[Tensor, "4 4"],
-    size: Float[Tensor, " 2"],
-    facing: Float[Tensor, " 3"],
-    typical_size: Float[Tensor, " 2"],
-) -> Float[Tensor, " 5"]:
-    """How unusual a sign is, as small angles and logarithms: it faces the drive, stands upright and has a usual size."""
-    R = T_world_sign[:3, :3]
-    right = facing @ R[:, 0]
-    log_size = (size / typical_size).log()
-    return torch.stack((right, R[2, 0], R[2, 2], log_size[0], log_size[1]))
 
 
 def _problem(
@@ -368,7 +290,7 @@ def _noise(
     """Covariances of the views of signs at `start`, seen from drifted poses with their own errors on top."""
     at = views.sign
     template = polygon.template(shape).to(start.size)[at]
-    _, (by_pose, _, _) = _corner_errors(
+    _, (by_pose, _, _) = corner_errors(
         se3.retract(T_world_camera, pose_error),
         start.T_world_sign[at],
         start.size[at],
@@ -399,32 +321,8 @@ def _box_scales(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, "m 16 2"]:
     return torch.diag_embed(offset).flatten(1, 2)
 
 
-def _corner_errors(
-    T_world_camera: Float[Tensor, "m 4 4"],
-    T_world_sign: Float[Tensor, "m 4 4"],
-    size: Float[Tensor, "m 2"],
-    template: Float[Tensor, "m c 2"],
-    observation: Float[Tensor, "m c 3 3"],
-) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor, Tensor]]:
-    """Pixel errors of all corners of every detection, and their Jacobians by camera, sign and size."""
-    m, c = template.shape[:2]
-
-    def for_corners(x: Tensor) -> Tensor:
-        return x[:, None].expand(m, c, *x.shape[1:]).flatten(0, 1)
-
-    error, (by_pose, by_sign, by_size) = residuals.sign_reprojection_jacobian(
-        for_corners(T_world_camera),
-        for_corners(T_world_sign),
-        for_corners(size),
-        template.flatten(0, 1),
-        observation.flatten(0, 1),
-    )
-    by_pose, by_sign, by_size = (J.reshape(m, 2 * c, -1) for J in (by_pose, by_sign, by_size))
-    return error.reshape(m, 2 * c), (by_pose, by_sign, by_size)
-
-
 def _distance(views: SignViews, start: SignStart) -> Float[Tensor, " m"]:
-    away = (views.p_world_camera - start.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
+    away = distance_away(views, start)
     return signed_distance(views.p_world_camera, away, views.frame, views.sign)
 
 

@@ -14,11 +14,13 @@ from crowdmap_torch.sign_fit import (
     SignFitConfig,
     SignStart,
     SignViews,
-    drifting_sign_view,
-    drifting_sign_view_jacobian,
     fit_signs,
     fit_signs_coarsely,
     robust_noise_scale,
+)
+from crowdmap_torch.sign_view import (
+    drifting_sign_view,
+    drifting_sign_view_jacobian,
     sign_view,
     sign_view_jacobian,
 )
@@ -83,7 +85,16 @@ def test_jacobians_are_those_of_forward_and_reverse_autograd(shape, generator):
     def drifting(xi, log_size, d_before, d_after):
         moved = se3.retract(T[0], xi)
         return drifting_sign_view(
-            moved, positive(size[0], log_size), before[0] + d_before, after[0] + d_after, *row, share[0]
+            moved,
+            positive(size[0], log_size),
+            before[0] + d_before,
+            after[0] + d_after,
+            row[0],
+            row[1],
+            row[2],
+            row[3],
+            row[4],
+            share[0],
         )
 
     zeros = [torch.zeros(k, dtype=F64) for k in (6, 2, 3, 3)]
@@ -209,7 +220,9 @@ def test_boxes_place_signs_by_their_centres(generator):
     half = half * (1 + 0.006 * (half.amax(-1, keepdim=True)))
     side = torch.tensor([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=F64)
     px = polygon.pad(
-        torch.nn.functional.pad((middle[:, None] + side * half[:, None]).mT, (0, 4)).mT.contiguous(),
+        torch.nn.functional.pad(
+            (middle[:, None] + side * half[:, None]).mT, (0, 4)
+        ).mT.contiguous(),
         torch.full((len(views),), 4),
     )
     ideal, _ = cameras.unproject(CAMERA, px)

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_mode, group_sum
-from crowdmap_torch.clustering.neighbours import near_pairs
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.pose_drift import closest_view
 from crowdmap_torch.sign_fit import (
@@ -18,10 +17,12 @@ from crowdmap_torch.sign_fit import (
     SignFitConfig,
     SignStart,
     SignViews,
+    distance_away,
     fit_signs,
     fit_signs_coarsely,
     robust_noise_scale,
 )
+from crowdmap_torch.sign_rejoin import RejoinConfig, rejoin, relabelled
 from crowdmap_torch.sign_start import against_the_drive, centre_points, starts
 from crowdmap_torch.tables import Journey, Signs, Tracklets, concatenate
 
@@ -38,31 +39,6 @@ REASONS = (
 )
 """What becomes of a tracklet, by code."""
 KEPT, FEW_FRAMES, NO_PARALLAX, TOO_FAR, BEHIND, RESIDUAL, UNCERTAIN, SIZE, REJOINED = range(9)
-
-
-@dataclass(frozen=True)
-class RejoinConfig:
-    """When two tracklets are one sign."""
-
-    max_common_share: float = 0.1
-    """Tracklets with a larger share of the shorter one's frames in common are two signs: both were seen at once."""
-
-    max_distance: float = 4.0
-    """Centres further apart, in standard deviations of both and of the drift between them, are two signs."""
-    max_distance_m: float = 5.0
-    """As are those further apart than this."""
-    max_size_ratio: float = 1.5
-    """As are signs whose width or height differ by more; the square of it where one of them is vague."""
-    min_facing: float = 0.5
-    """As are signs whose normals have a smaller scalar product, unless one of them is vague."""
-    vague_sigma_m: float = 0.7
-    """A sign is vague if its centre has a larger standard deviation."""
-    drift_m: float = 0.029
-    """Drift of positions over one metre of travel; it grows with the square root of the way."""
-    speed: float = 12.0
-    """Turns the time between two tracklets into a way [m/s]."""
-    max_gap_s: float = 20.0
-    """Tracklets with a longer silence between them are two passes of a sign, and poses do not come back the same."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +114,11 @@ def triangulate_signs(
     fit, scale = _fit(views, shape[label], config)
 
     t_s = (journey.t_ns - journey.t_ns[0]).to(journey.T_world_camera) * 1e-9
-    group = _rejoin(views, t_s[views.frame], fit, shape[label], config.rejoin)
+    group = rejoin(views, t_s[views.frame], fit, shape[label], config.rejoin)
     joined = group != torch.arange(len(label), device=group.device)
     if bool(joined.any()):
         reason[label[joined]] = REJOINED
-        tracklets = replace(tracklets, label=_relabelled(tracklets, journey, label, group))
+        tracklets = replace(tracklets, label=relabelled(tracklets, journey, label, group))
         # Second detections of a frame stay with the tracklet that is given up.
         still = tracklets.label[rows] == label[group][views.sign]
         rows, views = rows[still], views[still]
@@ -268,90 +244,6 @@ def _refit(
     return result, merged(scale, new_scale)
 
 
-def _rejoin(
-    views: SignViews,
-    t_s: Float[Tensor, " m"],
-    fit: SignFit,
-    shape: Int[Tensor, " n"],
-    rules: RejoinConfig,
-) -> Int[Tensor, " n"]:
-    """For each tracklet the first of those that show the same sign: itself, unless geometry says otherwise."""
-    n = len(shape)
-    centre = fit.T_world_sign[:, :3, 3]
-    pairs = near_pairs(centre, radius=rules.max_distance_m, count=8)
-    a, b = pairs.unbind(-1)
-    begin = torch.full_like(fit.cost, torch.inf).scatter_reduce(0, views.sign, t_s, "amin")
-    end = torch.full_like(fit.cost, -torch.inf).scatter_reduce(0, views.sign, t_s, "amax")
-    gap_s = torch.maximum(begin[a] - end[b], begin[b] - end[a]).clamp_min(0)
-    drift = rules.drift_m * (gap_s * rules.speed + 1).sqrt()
-    eye = torch.eye(3, dtype=drift.dtype, device=drift.device)
-    covariance = fit.covariance[a] + fit.covariance[b] + drift.square()[:, None, None] * eye
-    offset = (centre[a] - centre[b])[..., None]
-    distance_sq = (offset.mT @ torch.linalg.solve(covariance, offset))[:, 0, 0]
-    facing = (fit.T_world_sign[a, :3, 2] * fit.T_world_sign[b, :3, 2]).sum(-1)
-    ratio = torch.maximum(fit.size[a] / fit.size[b], fit.size[b] / fit.size[a]).amax(-1)
-    # Where the place is vague, the views were few and far: then size and normal are no better known.
-    sigma = torch.linalg.eigvalsh(fit.covariance)[:, -1].clamp_min(0).sqrt()
-    is_vague = torch.maximum(sigma[a], sigma[b]) > rules.vague_sigma_m
-    agrees = (
-        (distance_sq < rules.max_distance**2)
-        & (gap_s < rules.max_gap_s)
-        & (shape[a] == shape[b])
-        & ((facing > rules.min_facing) | is_vague)
-        & (ratio < torch.where(is_vague, rules.max_size_ratio**2, rules.max_size_ratio))
-    )
-    candidates = pairs[agrees][torch.argsort(distance_sq[agrees], stable=True)]
-    return _exclusive_groups(views, candidates, n, rules.max_common_share)
-
-
-def _exclusive_groups(
-    views: SignViews, pairs: Int[Tensor, "p 2"], n: int, max_common_share: float
-) -> Int[Tensor, " n"]:
-    """Groups made by joining pairs in order, unless many frames show both: two things seen at once are two things.
-
-    Some frames may: a sign that is detected twice in a frame is in two tracklets there.
-    """
-    group = list(range(n))
-    frames = {
-        sign: set(views.frame[views.sign == sign].tolist())
-        for sign in sorted(set(pairs.flatten().tolist()))
-    }
-    for a, b in pairs.tolist():
-        first, second = sorted((group[a], group[b]))
-        if first == second:
-            continue
-        most = max_common_share * min(len(frames[first]), len(frames[second]))
-        if len(frames[first] & frames[second]) > most:
-            continue
-        frames[first] |= frames.pop(second)
-        group = [first if g == second else g for g in group]
-    return torch.tensor(group, dtype=torch.int64, device=views.sign.device)
-
-
-def _relabelled(
-    tracklets: Tracklets, journey: Journey, label: Int[Tensor, " n"], group: Int[Tensor, " n"]
-) -> Int[Tensor, " d"]:
-    """Labels after tracklets were rejoined; in a frame that both have, the one that takes over keeps its own detection."""
-    new = torch.arange(tracklets.count, device=label.device)
-    new[label] = label[group]
-    old = tracklets.label.clamp_min(0)
-    moved = (tracklets.label >= 0) & (new[old] != old)
-    # Of each frame and new label the first row counts, and rows that keep their label come first.
-    order = torch.argsort(moved.long(), stable=True)
-    key = (new[old] * journey.frame_count + journey.signs.frame)[order]
-    by_key = torch.argsort(key, stable=True)
-    repeated = torch.zeros_like(moved)
-    repeated[1:] = key[by_key][1:] == key[by_key][:-1]
-    second = torch.zeros_like(moved)
-    second[order[by_key]] = repeated
-    return torch.where(moved & ~second, new[old], tracklets.label)
-
-
-def _closest_distance(views: SignViews, fit: SignFit) -> Float[Tensor, " n"]:
-    away = (views.p_world_camera - fit.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
-    return away[closest_view(away, views.sign)]
-
-
 def _fates(
     views: SignViews,
     fit: SignFit,
@@ -360,6 +252,7 @@ def _fates(
 ) -> Int[Tensor, " n"]:
     """Whether each sign is kept, or why it is pruned; the first reason counts."""
     n = len(scale)
+    away = distance_away(views, fit)
     in_camera = se3.transform(
         se3.inverse(views.T_world_camera), fit.T_world_sign[views.sign, :3, 3]
     )
@@ -374,7 +267,7 @@ def _fates(
     tests = (
         (BEHIND, group_sum(is_behind, views.sign, n) > 0),
         (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(config.min_parallax_deg)),
-        (TOO_FAR, _closest_distance(views, fit) > config.max_distance_m),
+        (TOO_FAR, away[closest_view(away, views.sign)] > config.max_distance_m),
         (SIZE, ((fit.size < low) | (fit.size > high)).any(-1)),
         (FEW_FRAMES, agreeing < config.min_frames),
         (RESIDUAL, agreeing < config.min_inlier_share * number),
@@ -410,7 +303,7 @@ def _signs(
     """The table of all fitted signs, and by how much their corners were turned to start at the top left."""
     n = len(shape)
     T, size, turn = polygon.canonical_with_shift(fit.T_world_sign, fit.size, shape)
-    away = (views.p_world_camera - fit.T_world_sign[views.sign, :3, 3]).norm(dim=-1)
+    away = distance_away(views, fit)
     agrees = fit.error_sq < config.fit.tukey**2
     detections = journey.signs[rows]
     score = torch.where(detections.score.isnan(), torch.ones_like(away), detections.score)

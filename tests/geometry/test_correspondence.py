@@ -24,9 +24,7 @@ def two_views(generator):
 def test_vertex_costs_are_epipolar_costs_of_all_pairs(two_views, components):
     T_a, T_b, p, q = two_views
     F = fundamental(T_a, T_b)
-    expected = epipolar_cost(
-        F[:, None, None], p[:, :, None], q[:, None, :], components=components
-    )
+    expected = epipolar_cost(F[:, None, None], p[:, :, None], q[:, None, :], components=components)
     found = correspondence.vertex_costs(F, p, q, components=components)
     torch.testing.assert_close(found, expected)
 

@@ -22,12 +22,11 @@ from sign_drive import (
 from crowdmap_torch.clustering.spectral import same_partition
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.epipolar import epipolar_cost, fundamental
+from crowdmap_torch.sign_sights import sign_pair_costs, sign_sights
 from crowdmap_torch.stages.associate import (
     SignAssociationConfig,
     SignAssociator,
     associate_signs,
-    sign_pair_costs,
-    sign_sights,
 )
 
 CONFIG = SignAssociationConfig()
@@ -83,6 +82,7 @@ def test_stepping_gives_exactly_the_batch():
             frame, drive.journey.T_world_camera[frame], drive.journey.signs[rows]
         )
         assert torch.equal(label, batch.label[rows])
+        assert batch.shift is not None
         assert torch.equal(shift, batch.shift[rows])
     assert associator.count == batch.count
 

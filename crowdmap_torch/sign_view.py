@@ -1,0 +1,127 @@
+"""What one detection says of a sign: pixel errors of all its corners at once, whitened, with Jacobians (IV-B).
+
+`residuals.sign_reprojection` is one corner; here the corners of one detection, which share the error of the view's pose.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch import residuals
+from crowdmap_torch.geometry import se3
+
+
+def sign_view(
+    T_world_sign: Float[Tensor, "4 4"],
+    size: Float[Tensor, " 2"],
+    T_world_camera: Float[Tensor, "4 4"],
+    template: Float[Tensor, "c 2"],
+    observation: Float[Tensor, "c 3 3"],
+    expected: Float[Tensor, " e"],
+    whitening: Float[Tensor, "e e"],
+) -> Float[Tensor, " e"]:
+    """Whitened pixel errors of all corners of one detection, beyond those expected of the pose's own error (IV-B)."""
+    error = torch.func.vmap(residuals.sign_reprojection, in_dims=(None, None, None, 0, 0))(
+        T_world_camera, T_world_sign, size, template, observation
+    )
+    return whitening @ (error.reshape(-1) - expected)
+
+
+def drifting_sign_view(
+    T_world_sign: Float[Tensor, "4 4"],
+    size: Float[Tensor, " 2"],
+    before: Float[Tensor, " 3"],
+    after: Float[Tensor, " 3"],
+    T_world_camera: Float[Tensor, "4 4"],
+    template: Float[Tensor, "c 2"],
+    observation: Float[Tensor, "c 3 3"],
+    expected: Float[Tensor, " e"],
+    whitening: Float[Tensor, "e e"],
+    share: Float[Tensor, ""],
+) -> Float[Tensor, " e"]:
+    """`sign_view` from a pose whose position is off by the interpolation of two knots."""
+    moved = se3.make(
+        T_world_camera[:3, :3], T_world_camera[:3, 3] + (1 - share) * before + share * after
+    )
+    return sign_view(T_world_sign, size, moved, template, observation, expected, whitening)
+
+
+def sign_view_jacobian(
+    T_world_sign: Float[Tensor, "m 4 4"],
+    size: Float[Tensor, "m 2"],
+    T_world_camera: Float[Tensor, "m 4 4"],
+    template: Float[Tensor, "m c 2"],
+    observation: Float[Tensor, "m c 3 3"],
+    expected: Float[Tensor, "m e"],
+    whitening: Float[Tensor, "m e e"],
+) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor]]:
+    """`sign_view` and its Jacobians by sign pose and relative size."""
+    error, (_, by_sign, by_size) = corner_errors(
+        T_world_camera, T_world_sign, size, template, observation
+    )
+    whitened = (whitening @ (error - expected)[..., None])[..., 0]
+    return whitened, (whitening @ by_sign, whitening @ by_size)
+
+
+def drifting_sign_view_jacobian(
+    T_world_sign: Float[Tensor, "m 4 4"],
+    size: Float[Tensor, "m 2"],
+    before: Float[Tensor, "m 3"],
+    after: Float[Tensor, "m 3"],
+    T_world_camera: Float[Tensor, "m 4 4"],
+    template: Float[Tensor, "m c 2"],
+    observation: Float[Tensor, "m c 3 3"],
+    expected: Float[Tensor, "m e"],
+    whitening: Float[Tensor, "m e e"],
+    share: Float[Tensor, " m"],
+) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """`drifting_sign_view` and its Jacobians by sign pose, relative size and the two knots."""
+    a = share[:, None]
+    p = T_world_camera[:, :3, 3] + (1 - a) * before + a * after
+    moved = se3.make(T_world_camera[:, :3, :3], p)
+    whitened, (by_sign, by_size) = sign_view_jacobian(
+        T_world_sign, size, moved, template, observation, expected, whitening
+    )
+    # A camera that moves one way sees the sign move the other way.
+    by_drift = -by_sign[..., :3]
+    a = a[..., None]
+    return whitened, (by_sign, by_size, (1 - a) * by_drift, a * by_drift)
+
+
+def sign_habit(
+    T_world_sign: Float[Tensor, "4 4"],
+    size: Float[Tensor, " 2"],
+    facing: Float[Tensor, " 3"],
+    typical_size: Float[Tensor, " 2"],
+) -> Float[Tensor, " 5"]:
+    """How unusual a sign is, as small angles and logarithms: it faces the drive, stands upright and has a usual size."""
+    R = T_world_sign[:3, :3]
+    right = facing @ R[:, 0]
+    log_size = (size / typical_size).log()
+    return torch.stack((right, R[2, 0], R[2, 2], log_size[0], log_size[1]))
+
+
+def corner_errors(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    T_world_sign: Float[Tensor, "m 4 4"],
+    size: Float[Tensor, "m 2"],
+    template: Float[Tensor, "m c 2"],
+    observation: Float[Tensor, "m c 3 3"],
+) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor, Tensor]]:
+    """Pixel errors of all corners of every detection, and their Jacobians by camera, sign and size."""
+    m, c = template.shape[:2]
+
+    def for_corners(x: Tensor) -> Tensor:
+        return x[:, None].expand(m, c, *x.shape[1:]).flatten(0, 1)
+
+    error, (by_pose, by_sign, by_size) = residuals.sign_reprojection_jacobian(
+        for_corners(T_world_camera),
+        for_corners(T_world_sign),
+        for_corners(size),
+        template.flatten(0, 1),
+        observation.flatten(0, 1),
+    )
+    by_pose, by_sign, by_size = (J.reshape(m, 2 * c, -1) for J in (by_pose, by_sign, by_size))
+    return error.reshape(m, 2 * c), (by_pose, by_sign, by_size)
