@@ -69,11 +69,11 @@ class AdjustConfig:
     """Prior of a control point's place: only there to keep a marker that nothing holds."""
     lane_slide_m: float = 0.3
     """How far a control point may about slide along its marker in one step of the solver."""
-    drift_spacing_m: float = 2.0
+    drift_spacing_m: float = 3.0
     """Stretch over which the drift of the poses is taken to stand still."""
-    keyframe_spacing_m: float = 2.0
+    keyframe_spacing_m: float = 3.0
     """Lane points are taken from frames this far apart."""
-    points_per_detection: int = 6
+    points_per_detection: int = 5
     """Most points of a lane detection that are used."""
     max_ground_distance_m: float = 25.0
     """Lane points that meet the road further ahead are left out."""

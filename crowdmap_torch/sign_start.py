@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_median, group_sum
@@ -102,11 +102,6 @@ def against_the_drive(views: SignViews, count: int) -> Float[Tensor, "count 3"]:
     """Horizontal direction against the mean optical axis of each sign's views: where it probably faces."""
     axis = views.T_world_camera[:, :3, 2] * views.T_world_camera.new_tensor([1.0, 1.0, 0.0])
     return -torch.nn.functional.normalize(group_sum(axis, views.sign, count), dim=-1)
-
-
-def corner_mask(views: SignViews, shape: Int[Tensor, " n"]) -> Bool[Tensor, "m 8"]:
-    """True for the slots of each view that hold a corner."""
-    return polygon.corner_mask(shape)[views.sign]
 
 
 def _mean_ray(views: SignViews) -> Float[Tensor, "m 3"]:
