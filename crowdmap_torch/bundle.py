@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -102,6 +102,8 @@ class Bundle(nn.Module):
     stays on the manifold.
     """
 
+    match_t: Tensor
+    match_valid: Tensor
     scale: Tensor
     """Standard deviation of sign corners and lane points [px], as the residuals show it."""
 
@@ -136,6 +138,9 @@ class Bundle(nn.Module):
         self.frame = frame
         """Frame of each pose, counted over all journeys."""
         self.nodes = nodes
+        # Where each lane point was followed to is part of the checkpoint: matching starts from there.
+        self.register_buffer("match_t", matches.t.clone())
+        self.register_buffer("match_valid", matches.valid.clone())
         self.lane_rows: Tensor | None = None
         self.held: CostTerm | None = None
         self.beside = beside
@@ -172,9 +177,9 @@ class Bundle(nn.Module):
         values = self.values()
         if len(self.lane_points):
             pose = values["pose"][self.lane_points.frame]
-            self.matches = follow(
-                self.matches, self.lane_points, pose, values["lane"], self.lane_count
-            )
+            last = replace(self.matches, t=self.match_t, valid=self.match_valid)
+            self.matches = follow(last, self.lane_points, pose, values["lane"], self.lane_count)
+            self.match_t, self.match_valid = self.matches.t, self.matches.valid
             rows, weight, _ = spline_basis.window_flat(
                 self.matches.t.clamp_min(0),
                 spline_basis.starts(self.lane_count)[self.matches.lane],
