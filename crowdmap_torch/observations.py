@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import camera, polygon
+from crowdmap_torch.road.placing import points_ahead
 from crowdmap_torch.tables import Association, Journey, RoadEstimate, Rows, Signs, concatenate
 
 _CURVATURE = 1e-3
@@ -131,8 +132,12 @@ def lane_point_observations(
         use = thin & key[journey.lanes.frame[points.detection]]
         points = points[use]
         frame = journey.lanes.frame[points.detection]
-        normal, height = road.normal_camera[frame], road.height[frame]
+        normal = road.normal_camera[frame]
+        # The plane is put through the road where the car drove it later: beside the car a road that
+        # leans ever more would be off by decimetres at the next bend.
+        on_road, is_met = points_ahead(journey, road, points)
         ray = torch.nn.functional.pad(points.ideal, (0, 1), value=1.0)
+        height = torch.where(is_met, (normal * on_road).sum(-1), road.height[frame])
         distance = height / (normal * ray).sum(-1).clamp_min(1e-3)
         slope = road.sigma[frame] + distance * _CURVATURE
         tables.append(

@@ -274,6 +274,27 @@ def test_the_height_of_far_points_is_trusted_less():
     assert (by_distance.diff() > 0).all() and by_distance[0] >= 0.05
 
 
+def test_planes_lead_through_the_road_where_the_car_drove_it_later():
+    journey = lane_drive(metres(60, 0.5), [8])
+    # From 10 m on the road leans by 0.02 to the right of the upright car.
+    lean = 0.02 * (journey.T_world_camera[:, 0, 3] > 10).to(torch.float64)
+    normal = torch.stack((lean, torch.ones_like(lean), torch.zeros_like(lean)), dim=1)
+    normal = torch.nn.functional.normalize(normal, dim=1)
+    road = RoadEstimate(normal, torch.full_like(lean, 1.5), torch.full_like(lean, 1e-3))
+    rows = lane_point_observations(
+        [journey], [road], keyframe_spacing=1.0, points_per_detection=8, height_sigma=0.05
+    )
+    first = rows[rows.frame == 0]
+    ray = torch.nn.functional.pad(first.ideal, (0, 1), value=1.0)
+    at = ray * (first.camera_height / (first.normal_camera * ray).sum(1))[:, None]
+    leaning = at[:, 2] > 12
+    assert leaning.any() and (at[:, 2] < 9).any()
+    height = torch.where(leaning, 1.5 - 0.02 * at[:, 0], 1.5)
+    # Half a metre to either side of 10 m the lean is interpolated.
+    known = leaning | (at[:, 2] < 9)
+    torch.testing.assert_close(at[known, 1], height[known], atol=2e-3, rtol=0)
+
+
 def test_a_journey_without_lanes_gives_no_rows():
     journey = make_journey(make_rig(), driving_east(metres(3, 1.0)))
     rows = lane_point_observations(

@@ -11,8 +11,8 @@ from torch import Tensor
 from crowdmap_torch.geometry import camera as camera_module
 from crowdmap_torch.geometry.plane import ground_points
 from crowdmap_torch.road.level import Level, level_of, slopes_of_normal
-from crowdmap_torch.road.surface import DriveSurface, lay_surface, meet
-from crowdmap_torch.tables import Journey, RoadEstimate, Rows
+from crowdmap_torch.road.surface import DriveSurface, SurfacePoints, lay_surface, meet
+from crowdmap_torch.tables import Journey, LanePoints, RoadEstimate, Rows
 
 _SHIFT_WINDOW_M = 2.0
 """Way over which the white noise of positions is averaged."""
@@ -60,16 +60,8 @@ def place_on_surface(journey: Journey, road: RoadEstimate) -> PlacedPoints:
     if not len(journey.lane_points):
         return place_on_planes(journey, road)
     level = level_of(journey)
-    alpha, beta = slopes_of_normal(road.normal_camera, level.R_road_camera)
-    surface = lay_surface(level, alpha, beta, road.height)
+    surface, points, _ = _meet_surface(journey, level, road, journey.lane_points)
     frame = journey.lanes.frame[journey.lane_points.detection]
-    ray = torch.nn.functional.pad(journey.lane_points.ideal, (0, 1), value=1.0)
-    in_road = ray @ level.R_road_camera.T
-    in_road = in_road / in_road[:, 2:]
-    depression = in_road[:, 1] + alpha[frame] + beta[frame] * in_road[:, 0]
-    ray_world = (level.R_world_road[frame] @ in_road[..., None])[..., 0]
-    depth = road.height[frame] / depression.clamp_min(0.02)
-    points = meet(surface, ray_world, frame, depth)
     depth = points.station - surface.station[frame]
     near = _nearest_view(journey, level, points.offset)
     seen_at = torch.maximum(points.station - near, surface.station[frame])
@@ -80,6 +72,16 @@ def place_on_surface(journey: Journey, road: RoadEstimate) -> PlacedPoints:
         offset=points.offset,
         is_placed=points.is_met,
     )
+
+
+def points_ahead(
+    journey: Journey, road: RoadEstimate, points: LanePoints
+) -> tuple[Float[Tensor, "p 3"], Bool[Tensor, " p"]]:
+    """Lane points in the camera's frame, on the surface that the car drove, and which of them lie on it."""
+    if not len(points):
+        return points.ideal.new_zeros(0, 3), torch.zeros_like(points.detection, dtype=torch.bool)
+    _, met, ray = _meet_surface(journey, level_of(journey), road, points)
+    return met.depth[:, None] * ray, met.is_met
 
 
 def lateral_sigma(
@@ -103,6 +105,22 @@ def lateral_sigma(
     by_noise = (sigma_ideal * depth).square() * (1 + slant.square())
     by_normal = (normal_sigma * slant * depth).square() + (normal_sigma * depth).square()
     return (by_noise + by_normal + drift**2 * depth).sqrt()
+
+
+def _meet_surface(
+    journey: Journey, level: Level, road: RoadEstimate, points: LanePoints
+) -> tuple[DriveSurface, SurfacePoints, Float[Tensor, "p 3"]]:
+    """The surface of a drive, where the rays of lane points meet it, and the rays in the camera's frame."""
+    alpha, beta = slopes_of_normal(road.normal_camera, level.R_road_camera)
+    surface = lay_surface(level, alpha, beta, road.height)
+    frame = journey.lanes.frame[points.detection]
+    ray = torch.nn.functional.pad(points.ideal, (0, 1), value=1.0)
+    in_road = ray @ level.R_road_camera.T
+    ray, in_road = ray / in_road[:, 2:], in_road / in_road[:, 2:]
+    depression = in_road[:, 1] + alpha[frame] + beta[frame] * in_road[:, 0]
+    ray_world = (level.R_world_road[frame] @ in_road[..., None])[..., 0]
+    depth = road.height[frame] / depression.clamp_min(0.02)
+    return surface, meet(surface, ray_world, frame, depth), ray
 
 
 def _nearest_view(

@@ -61,6 +61,8 @@ class SurfacePoints:
     """To the right of it, in the top view [m]."""
     point: Float[Tensor, "p 3"]
     """In reckoned coordinates."""
+    depth: Float[Tensor, " p"]
+    """In units of the rays' length."""
     is_met: Bool[Tensor, " p"]
     """False for rays that do not come down to the surface ahead."""
 
@@ -125,7 +127,7 @@ def meet(
     offset = gap[:, 0] * course.sin() - gap[:, 1] * course.cos()
     above = point[:, 2] - place[:, 2] - cross * offset
     is_met = (above.abs() < 0.02) & (along.abs() < 0.5) & (station > start)
-    return SurfacePoints(station, offset, point, is_met)
+    return SurfacePoints(station, offset, point, depth, is_met)
 
 
 def flattened_rays(

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import torch
 from road_drives import SimulatedDrives, blind_journey, poses_on_plane, simulate, true_road
+from torch import Tensor
 
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.plane import ground_points
@@ -11,7 +12,7 @@ from crowdmap_torch.road.level import (
     road_frame,
     slopes_of_normal,
 )
-from crowdmap_torch.road.placing import place_on_planes, place_on_surface
+from crowdmap_torch.road.placing import place_on_planes, place_on_surface, points_ahead
 from crowdmap_torch.road.reckoning import fit_slip
 from crowdmap_torch.road.surface import lay_surface, meet
 from crowdmap_torch.simulate.vehicle import VehicleConfig
@@ -87,21 +88,26 @@ def test_surface_places_points_of_hills_better_than_planes(tmp_path) -> None:
     truth = drives.truths[0]
     points = truth.journey.lane_points
     marker = truth.lane[truth.journey.lanes.row][points.detection]
+    frame = truth.journey.lanes.frame[points.detection]
     off = {}
     for place in (place_on_planes, place_on_surface):
         placed = place(truth.journey, true_road(truth))
-        frame = truth.journey.lanes.frame[points.detection]
         near = placed.is_placed & (placed.depth > 10) & (placed.depth < 20) & (marker >= 0)
         at = se3.transform(truth.T_true_given[frame[near]], placed.point_world[near])
-        lane = drives.survey.lane_points
-        height = torch.stack(
-            [
-                lane.point_world[lane.lane == k][
-                    torch.cdist(at[:, :2], lane.point_world[lane.lane == k][:, :2]).argmin(-1)
-                ][:, 2]
-                for k in range(len(drives.survey.lane_id))
-            ]
-        ).T.gather(1, marker[near, None])[:, 0]
-        off[place] = (at[:, 2] - height).abs().median()
+        off[place] = (at[:, 2] - _height_of(marker[near], at, drives)).abs().median()
     # The pose of the seeing frame taken off, not that of the nearest: drift stays in both.
     assert off[place_on_surface] < off[place_on_planes]
+    on_road, is_met = points_ahead(truth.journey, true_road(truth), points)
+    near = is_met & (on_road[:, 2] > 10) & (on_road[:, 2] < 20) & (marker >= 0)
+    at = se3.transform(truth.T_world_camera[frame[near]], on_road[near])
+    off_ahead = (at[:, 2] - _height_of(marker[near], at, drives)).abs().median()
+    assert off_ahead < 0.75 * off[place_on_planes]
+
+
+def _height_of(marker: Tensor, at: Tensor, drives: SimulatedDrives) -> Tensor:
+    """Height of the true markers, each nearest to a place [m]."""
+    lane = drives.survey.lane_points
+    own = 1e6 * marker[:, None].to(at)
+    place = torch.cat((lane.point_world[:, :2], 1e6 * lane.lane[:, None].to(at)), dim=1)
+    nearest = torch.cdist(torch.cat((at[:, :2], own), dim=1), place).argmin(1)
+    return lane.point_world[nearest, 2]
