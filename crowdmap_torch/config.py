@@ -18,6 +18,7 @@ from crowdmap_torch.crowd import CrowdConfig
 from crowdmap_torch.stages.associate import SignAssociationConfig
 from crowdmap_torch.stages.associate_lanes import LaneAssociationConfig
 from crowdmap_torch.stages.cluster_lanes import LaneClusterConfig
+from crowdmap_torch.stages.harvest import HarvestConfig
 from crowdmap_torch.stages.join_lanes import LaneJoinConfig
 from crowdmap_torch.stages.lanes import LaneConfig
 from crowdmap_torch.stages.road import RoadConfig
@@ -46,6 +47,8 @@ class MapperConfig:
     """IV-D."""
     crowd: CrowdConfig = field(default_factory=CrowdConfig)
     """V-A and V-B: clustering and alignment of signs, repeated."""
+    harvest: HarvestConfig = field(default_factory=HarvestConfig)
+    """V-A: detections that clustering set aside, brought back."""
     lane_join: LaneJoinConfig = field(default_factory=LaneJoinConfig)
     """V-A: lanes of many journeys."""
     lane_cluster: LaneClusterConfig = field(default_factory=LaneClusterConfig)

@@ -31,6 +31,15 @@ from crowdmap_torch.stages.align import unbiased_poses
 from crowdmap_torch.stages.associate import associate_signs
 from crowdmap_torch.stages.associate_lanes import associate_lanes
 from crowdmap_torch.stages.cluster_lanes import cluster_lanes
+from crowdmap_torch.stages.existence import existence
+from crowdmap_torch.stages.harvest import (
+    Harvest,
+    copies,
+    harvest_signs,
+    still_alone,
+    with_evidence,
+    without_signs,
+)
 from crowdmap_torch.stages.join_lanes import join_lanes
 from crowdmap_torch.stages.lanes import LaneReport, reconstruct_lanes
 from crowdmap_torch.stages.road import estimate_road
@@ -82,6 +91,8 @@ class FirstMap:
     associations: tuple[Association, ...]
     drifts: tuple[Float[Tensor, "f 6"], ...]
     """Per journey the tangents from the given poses to those without bias."""
+    harvest: Harvest | None
+    """What clustering had set aside and was brought back; None with `paper2017`, which does not."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +213,19 @@ def first_map(
         _sign_association(journey, m, members, crowd, number)
         for number, (journey, m) in enumerate(zip(journeys, maps, strict=True))
     )
-    return FirstMap(crowd.heads, lanes, crowd.tentative, crowd, associations, tuple(drifts))
+    heads, tentative, harvest = crowd.heads, crowd.tentative, None
+    if config.crowd.method != "paper2017":
+        made = [m.sign_tracklets for m in maps]
+        copy = copies(journeys, starts, heads, associations, config.harvest)
+        passed, heads = crowd.report.passed[~copy], heads[~copy]
+        associations = without_signs(associations, copy)
+        harvest = harvest_signs(journeys, starts, made, heads, associations, config.harvest)
+        associations = harvest.associations
+        heads = with_evidence(heads, journeys, associations, config.harvest)
+        sure = existence(heads.n_journeys, passed, config.crowd.existence)
+        heads = replace(heads, confidence=sure.to(heads.size))
+        tentative = tentative[still_alone(tentative, made, associations)]
+    return FirstMap(heads, lanes, tentative, crowd, associations, tuple(drifts), harvest)
 
 
 def build_bundle(
@@ -237,14 +260,19 @@ def finish_map(
     journeys = dataset.journeys
     poses = adjust.read_poses(bundle, journeys)
     signs, lanes, shared = adjust.read_map(bundle, first.signs, first.lanes)
+    associations = first.associations
+    if first.harvest is not None:
+        # Once more with the adjusted poses: what the first projections were too far off for.
+        made = [m.sign_tracklets for m in maps]
+        again = harvest_signs(journeys, poses, made, signs, associations, config.harvest)
+        associations = again.associations
+        signs = with_evidence(signs, journeys, associations, config.harvest)
     associations = tuple(
         replace(
             association,
             lane=detection_lanes(journey, m.road, pose, lanes, gate=config.adjust.lane_gate_m),
         )
-        for journey, m, pose, association in zip(
-            journeys, maps, poses, first.associations, strict=True
-        )
+        for journey, m, pose, association in zip(journeys, maps, poses, associations, strict=True)
     )
     provenance = {"config": config_hash(config), "journeys": [j.journey_id for j in journeys]}
     hd_map = as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)

@@ -40,6 +40,9 @@ def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict
         "lane pieces of single journeys": sum(len(m.lanes) for m in maps),
         "sign clusters": len(first.signs),
         "single signs": len(first.tentative),
+        "sign detections brought back": first.harvest.fitting + first.harvest.strays
+        if first.harvest
+        else 0,
         "sign detections used": sum(int((a.sign >= 0).sum()) for a in result.associations),
         "lane detections used": sum(int((a.lane >= 0).sum()) for a in result.associations),
         "signs of the map": int((signs.confidence >= config.min_confidence).sum()),
