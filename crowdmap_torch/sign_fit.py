@@ -3,31 +3,35 @@
 The poses of a journey are not exact, and their error hits all corners of a detection alike: it moves the sign in the
 image and leaves its outline. So one detection is one observation, whitened by its covariance: pixel noise of the
 corners, and the white noise of the pose that all of them share. What drifts slowly along the drive is estimated along
-with the sign (`pose_drift`). A sign is thus placed relative to the pose at its closest view; its size and depth rest
-on the outlines, which no pose error spoils.
+with the signs (`pose_drift`): all signs of a journey are one problem. Each sign is placed relative to the pose at its
+closest approach; its size and depth rest on the outlines, which no pose error spoils.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.drift_course import CourseConfig, DrivePath
 from crowdmap_torch.geometry import polygon, se3
+from crowdmap_torch.geometry.camera import project
 from crowdmap_torch.optim import levenberg_marquardt as lm
-from crowdmap_torch.optim.linear import DenseBackend
+from crowdmap_torch.optim.band import BandBackend, BandNormalEquations
 from crowdmap_torch.optim.linearize import residuals as rows_of_term
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.pose_drift import (
     DriftConfig,
-    DriftKnots,
+    PathPlaces,
+    closest_view,
     drift_terms,
-    place_knots,
-    signed_distance,
+    knot_count,
+    places_on_path,
 )
 from crowdmap_torch.sign_view import (
     corner_errors,
@@ -38,6 +42,9 @@ from crowdmap_torch.sign_view import (
     sign_view_jacobian,
 )
 from crowdmap_torch.tables import Rows
+
+APPROACH_FRAMES = 150
+"""Frames after a sign's closest view among which its closest approach is looked for."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,8 @@ class SignFitConfig:
     """White noise of rotations from frame to frame."""
     drift: DriftConfig = field(default_factory=DriftConfig)
     """What else the poses do between views."""
+    course: CourseConfig = field(default_factory=CourseConfig)
+    """What the car's course says of it."""
     tukey: float = 2.8
     """Detections with a root mean square whitened error beyond this many standard deviations have no say."""
     typical_size_m: float = 0.75
@@ -108,16 +117,29 @@ class SignStart:
 
 
 @dataclass(frozen=True)
+class CoarseFit:
+    """Signs fitted to views one by one, the drift counted as white noise."""
+
+    start: SignStart
+    cost: Float[Tensor, " n"]
+    error_sq: Float[Tensor, " m"]
+    """Mean square of each view's whitened error."""
+
+
+@dataclass(frozen=True)
 class SignFit:
-    """Signs fitted to views."""
+    """Signs fitted to views, each relative to the given pose at its closest approach."""
 
     T_world_sign: Float[Tensor, "n 4 4"]
     size: Float[Tensor, "n 2"]
-    cost: Float[Tensor, " n"]
+    frame: Int[Tensor, " n"]
+    """Of the closest approach: the nearest frame that has the sign in its image, detected or not."""
     covariance: Float[Tensor, "n 3 3"]
-    """Of the centre, relative to the pose at the closest view [m^2]."""
+    """Of the centre, relative to the pose at that frame [m^2]."""
     error_sq: Float[Tensor, " m"]
     """Mean square of each view's whitened error; views beyond `tukey` squared have no say."""
+    drift_scale: float
+    """By how much the poses drift, in multiples of what is usual."""
 
 
 @dataclass(frozen=True)
@@ -139,37 +161,50 @@ def fit_signs(
     start: SignStart,
     facing: Float[Tensor, "n 3"],
     noise_scale: Float[Tensor, " n"],
+    drive: DrivePath,
     config: SignFitConfig,
 ) -> SignFit:
     """Pose and size of every sign that minimise the Tukey-weighted whitened reprojection error (IV-B).
 
     `facing` is the horizontal direction against the drive. Unlike the paper, the poses' white noise and drift are
-    part of the model. A view's own pose error is integrated out to first order around its estimate, which takes a
-    second round: around zero instead, views that are off to the side would make the sign seem further away than it
-    is.
+    part of the model. The drift is one path for all signs, and how large it is the journey itself says. A view's own
+    pose error is integrated out to first order around its estimate, which takes a second round: around zero instead,
+    views that are off to the side would make the sign seem further away than it is.
     """
-    away = distance_away(views, start)
-    distance = signed_distance(views.p_world_camera, away, views.frame, views.sign)
-    knots = place_knots(distance, views.sign, config.drift)
-    drift = start.size.new_zeros(len(knots.landmark), 3)
+    window = _windowed(views, drive, start, config.drift)
+    at_knots = start.size.new_zeros(knot_count(drive.station, config.drift), 8)
     pose_error = start.size.new_zeros(len(views), 6)
-    # What the polyline leaves of a random walk between two knots, on average.
-    between = torch.full_like(away, config.drift.sigma_m**2 * config.drift.knot_m / 6)
-    problem, state, whitened = None, None, None
-    for _ in range(config.rounds):
-        drifted = se3.make(
-            views.T_world_camera[:, :3, :3], views.p_world_camera + knots.at_views(drift)
+    scale, normal, whitened = 1.0, None, None
+    for number in range(config.rounds):
+        drifted = se3.retract(views.T_world_camera, window.places.drift(at_knots)[:, :6])
+        position, rotation = config.drift.left_between
+        extra = torch.stack(
+            (
+                window.beyond_m * config.drift.sigma_m**2 + position,
+                window.beyond_m * config.drift.sigma_rad**2 + rotation,
+            ),
+            dim=-1,
         )
-        noise = _noise(views, drifted, shape, start, pose_error, noise_scale, between, config)
-        problem, values = _problem(views, shape, start, noise, facing, config)
-        problem = _with_drift(problem, views, shape, knots, config)
-        state = lm.solve(problem, {**values, "drift": drift}, config.lm)
+        noise = _noise(
+            views, drifted, shape, start, pose_error, noise_scale, scale**2 * extra, config
+        )
+        still, values = _problem(views, shape, start, noise, facing, config)
+        problem = _with_drift(
+            still, views, shape, window.places, len(at_knots), scale, drive, config
+        )
+        backend = BandBackend("drift")
+        state = lm.solve(problem, {**values, "drift": at_knots}, config.lm, backend=backend)
         start = SignStart(state.values["sign"], state.values["size"])
-        drift = state.values["drift"]
+        at_knots = state.values["drift"]
         whitened = _whitened(problem, state.values, shape, views)
         pose_error = _pose_error(whitened, noise, shape, views, config)
-    assert problem is not None and state is not None and whitened is not None
-    return _read(problem, state, _mean_square(whitened, shape, views))
+        if number == 0:
+            scale = _likely_scale(problem, state.values, len(at_knots), config.drift)
+        normal = backend.assemble(problem, state.values)
+    assert normal is not None and whitened is not None
+    return _read(
+        normal, views, start, at_knots, scale, drive, _mean_square(whitened, shape, views), config
+    )
 
 
 def fit_signs_coarsely(
@@ -178,16 +213,20 @@ def fit_signs_coarsely(
     start: SignStart,
     facing: Float[Tensor, "n 3"],
     config: SignFitConfig,
-) -> SignFit:
-    """`fit_signs` with the drift counted as white noise: a cheap problem for starts that are still far off."""
+) -> CoarseFit:
+    """Signs one by one, the drift counted as white noise: a cheap problem for starts that are still far off."""
     ones = torch.ones_like(start.size[:, 0])
     nothing = start.size.new_zeros(len(views), 6)
-    extra = _distance(views, start).abs() * config.drift.sigma_m**2
+    p, away = views.p_world_camera, distance_away(views, start)
+    way = (p - p[closest_view(away, views.sign)][views.sign]).norm(dim=-1)
+    variance = way.new_tensor((config.drift.sigma_m, config.drift.sigma_rad)).square()
+    extra = way[:, None] * variance
     noise = _noise(views, views.T_world_camera, shape, start, nothing, ones, extra, config)
     problem, values = _problem(views, shape, start, noise, facing, config)
     state = lm.solve(problem, values, config.coarse_lm)
     whitened = _whitened(problem, state.values, shape, views)
-    return _read(problem, state, _mean_square(whitened, shape, views))
+    found = SignStart(state.values["sign"], state.values["size"])
+    return CoarseFit(found, state.cost, _mean_square(whitened, shape, views))
 
 
 def distance_away(views: SignViews, fit: SignFit | SignStart) -> Float[Tensor, " m"]:
@@ -248,27 +287,64 @@ def _problem(
     return Problem(variables, terms, group_count=len(own)), values
 
 
+@dataclass(frozen=True)
+class _Window:
+    """Where views are on the path, no further from their sign's closest one than its window reaches."""
+
+    places: PathPlaces
+    beyond_m: Float[Tensor, " m"]
+    """Way from the window to views outside of it."""
+
+
+def _windowed(views: SignViews, drive: DrivePath, start: SignStart, config: DriftConfig) -> _Window:
+    station = drive.station[views.frame]
+    middle = station[closest_view(distance_away(views, start), views.sign)][views.sign]
+    reach = config.max_window_m
+    inside = torch.minimum(torch.maximum(station, middle - reach), middle + reach)
+    return _Window(places_on_path(inside, config), (station - inside).abs())
+
+
 def _with_drift(
-    problem: Problem, views: SignViews, shape: Tensor, knots: DriftKnots, config: SignFitConfig
+    problem: Problem,
+    views: SignViews,
+    shape: Int[Tensor, " n"],
+    places: PathPlaces,
+    knots: int,
+    scale: float,
+    drive: DrivePath,
+    config: SignFitConfig,
 ) -> Problem:
-    """The same problem with the drift between views as further unknowns."""
+    """All signs as one problem, the drift that their views share as a further unknown."""
     terms = dict(problem.terms)
     for name, rows, _ in _by_corners(views, shape):
-        still = terms[name]
-        before = knots.before[rows]
+        still, before = terms[name], places.before[rows]
         terms[name] = CostTerm(
             drifting_sign_view,
             (*still.slots, ("drift", before), ("drift", before + 1)),
-            (*still.constants, knots.share[rows]),
+            (*still.constants, places.share[rows]),
             loss=still.loss,
             jacobian=drifting_sign_view_jacobian,
         )
-    drift = Variable(3, euclidean, group=knots.landmark)
+    variables = {name: replace(kind, group=None) for name, kind in problem.variables.items()}
     return Problem(
-        {**problem.variables, "drift": drift},
-        {**terms, **drift_terms(knots, config.drift)},
-        problem.group_count,
+        {**variables, "drift": Variable(8, euclidean)},
+        {**terms, "course": drive.course, **drift_terms(knots, config.drift, scale, places.share)},
     )
+
+
+def _likely_scale(
+    problem: Problem, values: Mapping[str, Tensor], knots: int, config: DriftConfig
+) -> float:
+    """The multiple of the usual drift under which the views are likeliest (marginal likelihood, to second order)."""
+    evidence = []
+    for scale in config.scales:
+        terms = drift_terms(knots, config, scale, values["drift"])
+        scaled = replace(problem, terms={**problem.terms, **terms})
+        minus_log = BandBackend("drift").assemble(scaled, values).log_evidence()
+        # The chain's own normalisation, and how usual such a scale is.
+        unusual = (math.log(scale) / config.sigma_log_scale) ** 2 / 2
+        evidence.append(float(minus_log) + 6 * knots * math.log(scale) + unusual)
+    return config.scales[min(range(len(evidence)), key=evidence.__getitem__)]
 
 
 def _by_corners(views: SignViews, shape: Int[Tensor, " n"]) -> list[tuple[str, Tensor, int]]:
@@ -284,10 +360,13 @@ def _noise(
     start: SignStart,
     pose_error: Float[Tensor, "m 6"],
     noise_scale: Float[Tensor, " n"],
-    extra_variance: Float[Tensor, " m"],
+    extra_variance: Float[Tensor, "m 2"],
     config: SignFitConfig,
 ) -> _Noise:
-    """Covariances of the views of signs at `start`, seen from drifted poses with their own errors on top."""
+    """Covariances of the views of signs at `start`, seen from drifted poses with their own errors on top.
+
+    `extra_variance` is that of positions and of rotations beyond their white noise.
+    """
     at = views.sign
     template = polygon.template(shape).to(start.size)[at]
     _, (by_pose, _, _) = corner_errors(
@@ -297,10 +376,8 @@ def _noise(
         template,
         views.observation,
     )
-    distance = _distance(views, start).abs()
-    position = config.pose_sigma_m**2 + extra_variance
-    rotation = config.pose_sigma_rad**2 + config.drift.sigma_rad**2 * distance
-    variance = torch.stack((position, rotation), dim=-1).repeat_interleave(3, dim=-1)
+    white = extra_variance.new_tensor((config.pose_sigma_m, config.pose_sigma_rad)).square()
+    variance = (white + extra_variance).repeat_interleave(3, dim=-1)
     box = (views.corners_px.amax(1) - views.corners_px.amin(1)).amax(-1)
     pixel = config.sigma_px**2 * (1 + (config.small_box_px / box).square())
     covariance = (by_pose * variance[:, None]) @ by_pose.mT
@@ -319,11 +396,6 @@ def _box_scales(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, "m 16 2"]:
     is_box = ((corners_px == low) | (corners_px == high)).all(-1).all(-1)
     offset = (corners_px - (low + high) / 2) * is_box[:, None, None]
     return torch.diag_embed(offset).flatten(1, 2)
-
-
-def _distance(views: SignViews, start: SignStart) -> Float[Tensor, " m"]:
-    away = distance_away(views, start)
-    return signed_distance(views.p_world_camera, away, views.frame, views.sign)
 
 
 def _pose_error(
@@ -358,16 +430,50 @@ def _whitened(
     return result
 
 
-def _read(problem: Problem, state: lm.LmState, error_sq: Float[Tensor, " m"]) -> SignFit:
-    normal = DenseBackend().assemble(problem, state.values)
-    covariance = normal.covariance()
-    first = normal.where.offset["sign"]
-    centre = first[:, None] + torch.arange(3, device=first.device)
-    own = torch.arange(len(first), device=first.device)[:, None, None]
-    return SignFit(
-        T_world_sign=state.values["sign"],
-        size=state.values["size"],
-        cost=state.cost,
-        covariance=covariance[own, centre[:, :, None], centre[:, None, :]],
-        error_sq=error_sq,
+def _read(
+    normal: BandNormalEquations,
+    views: SignViews,
+    start: SignStart,
+    at_knots: Float[Tensor, "k 8"],
+    scale: float,
+    drive: DrivePath,
+    error_sq: Float[Tensor, " m"],
+    config: SignFitConfig,
+) -> SignFit:
+    """The signs relative to the given poses at their closest approach, and the covariance of that."""
+    away = distance_away(views, start)
+    frame = closest_approach(
+        drive, start.T_world_sign[:, :3, 3], views.frame[closest_view(away, views.sign)]
     )
+    places = places_on_path(drive.station[frame], config.drift)
+    given = drive.T_world_camera[frame]
+    true = se3.retract(given, places.drift(at_knots)[:, :6])
+    T_world_sign = given @ se3.inverse(true) @ start.T_world_sign
+    in_camera = se3.transform(se3.inverse(given), T_world_sign[:, :3, 3])
+    turned = given[:, :3, :3] @ se3.skew(in_camera)
+    eye = torch.eye(3, dtype=given.dtype, device=given.device).expand_as(turned)
+    by_drift = torch.cat((-eye, turned, torch.zeros_like(eye[..., :2])), dim=-1)
+    share = places.share[:, None, None]
+    covariance = normal.covariance(
+        torch.cat((eye, torch.zeros_like(eye), torch.zeros_like(eye[..., :2])), dim=-1),
+        torch.stack(((1 - share) * by_drift, share * by_drift), dim=1),
+        torch.stack((places.before, places.before + 1), dim=-1),
+    )
+    # The one pose has noise of its own, which no path knows.
+    white = given.new_tensor((config.pose_sigma_m, config.pose_sigma_rad)).square()
+    own = white[0] * eye + white[1] * turned @ turned.mT
+    return SignFit(T_world_sign, start.size, frame, covariance + own, error_sq, scale)
+
+
+def closest_approach(
+    drive: DrivePath, centre: Float[Tensor, "n 3"], closest_view: Int[Tensor, " n"]
+) -> Int[Tensor, " n"]:
+    """The nearest of the frames from the closest view on that has each point in its image: few are detected at the last."""
+    ahead = torch.arange(APPROACH_FRAMES, device=centre.device)
+    frame = (closest_view[:, None] + ahead).clamp_max(len(drive.station) - 1)
+    in_camera = se3.transform(se3.inverse(drive.T_world_camera)[frame], centre[:, None])
+    _, visible = project(drive.camera, in_camera)
+    distance = torch.where(visible, in_camera.norm(dim=-1), torch.inf)
+    # The view itself counts, whatever its sign's centre as fitted.
+    distance[:, 0] = in_camera[:, 0].norm(dim=-1)
+    return frame.gather(1, distance.argmin(1, keepdim=True))[:, 0]

@@ -53,8 +53,8 @@ def rejoin(
     centre = fit.T_world_sign[:, :3, 3]
     pairs = near_pairs(centre, radius=rules.max_distance_m, count=8)
     a, b = pairs.unbind(-1)
-    begin = torch.full_like(fit.cost, torch.inf).scatter_reduce(0, views.sign, t_s, "amin")
-    end = torch.full_like(fit.cost, -torch.inf).scatter_reduce(0, views.sign, t_s, "amax")
+    begin = torch.full_like(fit.size[:, 0], torch.inf).scatter_reduce(0, views.sign, t_s, "amin")
+    end = torch.full_like(fit.size[:, 0], -torch.inf).scatter_reduce(0, views.sign, t_s, "amax")
     gap_s = torch.maximum(begin[a] - end[b], begin[b] - end[a]).clamp_min(0)
     drift = rules.drift_m * (gap_s * rules.speed + 1).sqrt()
     eye = torch.eye(3, dtype=drift.dtype, device=drift.device)

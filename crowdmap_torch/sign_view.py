@@ -32,8 +32,8 @@ def sign_view(
 def drifting_sign_view(
     T_world_sign: Float[Tensor, "4 4"],
     size: Float[Tensor, " 2"],
-    before: Float[Tensor, " 3"],
-    after: Float[Tensor, " 3"],
+    before: Float[Tensor, " 8"],
+    after: Float[Tensor, " 8"],
     T_world_camera: Float[Tensor, "4 4"],
     template: Float[Tensor, "c 2"],
     observation: Float[Tensor, "c 3 3"],
@@ -41,10 +41,8 @@ def drifting_sign_view(
     whitening: Float[Tensor, "e e"],
     share: Float[Tensor, ""],
 ) -> Float[Tensor, " e"]:
-    """`sign_view` from a pose whose position is off by the interpolation of two knots."""
-    moved = se3.make(
-        T_world_camera[:3, :3], T_world_camera[:3, 3] + (1 - share) * before + share * after
-    )
+    """`sign_view` from a pose that is off by the interpolation of two knots."""
+    moved = se3.retract(T_world_camera, ((1 - share) * before + share * after)[:6])
     return sign_view(T_world_sign, size, moved, template, observation, expected, whitening)
 
 
@@ -68,8 +66,8 @@ def sign_view_jacobian(
 def drifting_sign_view_jacobian(
     T_world_sign: Float[Tensor, "m 4 4"],
     size: Float[Tensor, "m 2"],
-    before: Float[Tensor, "m 3"],
-    after: Float[Tensor, "m 3"],
+    before: Float[Tensor, "m 8"],
+    after: Float[Tensor, "m 8"],
     T_world_camera: Float[Tensor, "m 4 4"],
     template: Float[Tensor, "m c 2"],
     observation: Float[Tensor, "m c 3 3"],
@@ -77,17 +75,21 @@ def drifting_sign_view_jacobian(
     whitening: Float[Tensor, "m e e"],
     share: Float[Tensor, " m"],
 ) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """`drifting_sign_view` and its Jacobians by sign pose, relative size and the two knots."""
+    """`drifting_sign_view` and its Jacobians by sign pose, relative size and the two knots.
+
+    By the rotation of the drift to first order: drifts are fractions of a degree.
+    """
     a = share[:, None]
-    p = T_world_camera[:, :3, 3] + (1 - a) * before + a * after
-    moved = se3.make(T_world_camera[:, :3, :3], p)
-    whitened, (by_sign, by_size) = sign_view_jacobian(
-        T_world_sign, size, moved, template, observation, expected, whitening
+    moved = se3.retract(T_world_camera, ((1 - a) * before + a * after)[:, :6])
+    error, (by_pose, by_sign, by_size) = corner_errors(
+        moved, T_world_sign, size, template, observation
     )
-    # A camera that moves one way sees the sign move the other way.
-    by_drift = -by_sign[..., :3]
-    a = a[..., None]
-    return whitened, (by_sign, by_size, (1 - a) * by_drift, a * by_drift)
+    whitened = (whitening @ (error - expected)[..., None])[..., 0]
+    by_drift, a = torch.nn.functional.pad(whitening @ by_pose, (0, 2)), a[..., None]
+    return whitened, (
+        *(whitening @ by_sign, whitening @ by_size),
+        *((1 - a) * by_drift, a * by_drift),
+    )
 
 
 def sign_habit(

@@ -1,4 +1,4 @@
-"""Knots of the drift: where they lie, and that it is a random walk held at the closest view."""
+"""The path of the drift: where places lie on it, and how its spread grows."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from crowdmap_torch.pose_drift import (
     DriftConfig,
     closest_view,
     drift_terms,
-    place_knots,
-    signed_distance,
+    knot_count,
+    places_on_path,
 )
 
 F64 = torch.float64
-CONFIG = DriftConfig(sigma_m=0.1, knot_m=4.0, max_knots=6)
+CONFIG = DriftConfig(sigma_m=0.1, sigma_rad=1e-3, forget_m=400.0)
 
 
 def test_the_closest_view_is_the_first_of_the_nearest():
@@ -25,42 +25,37 @@ def test_the_closest_view_is_the_first_of_the_nearest():
     assert closest_view(away, group).tolist() == [4, 1]
 
 
-def test_distances_are_signed_by_time():
-    p = torch.tensor([[0.0, 0, 0], [0, 3, 0], [0, 6, 0], [0, 7, 0]], dtype=F64)
-    away = torch.tensor([9.0, 6.0, 3.0, 3.5], dtype=F64)
-    distance = signed_distance(p, away, torch.arange(4), torch.zeros(4, dtype=torch.int64))
-    assert distance.tolist() == [-6.0, -3.0, 0.0, 1.0]
+def test_places_lie_between_their_knots():
+    station = torch.tensor([0.0, 1.0, 4.0, 6.5, 12.0], dtype=F64)
+    places = places_on_path(station, CONFIG)
+    knots = knot_count(station, CONFIG)
+    assert int(places.before.max()) + 1 < knots
+    at_knots = (torch.arange(knots) * CONFIG.knot_m)[:, None].expand(-1, 8).to(F64)
+    torch.testing.assert_close(places.drift(at_knots)[:, 0], station)
 
 
-def test_views_lie_between_their_knots():
-    distance = torch.tensor([-9.0, -4.0, 0.0, 2.0, -100.0, 0.0], dtype=F64)
-    landmark = torch.tensor([0, 0, 0, 0, 1, 1])
-    knots = place_knots(distance, landmark, CONFIG)
-    place = (torch.arange(len(knots.landmark)) - knots.anchor[knots.landmark]).to(F64)
-    drift = (place * CONFIG.knot_m)[:, None].expand(-1, 3)
-    # A drift equal to the place is interpolated to the distance itself, as far as knots reach.
-    expected = distance.clamp(-CONFIG.max_knots * CONFIG.knot_m, None)
-    torch.testing.assert_close(knots.at_views(drift)[:, 0], expected)
-    assert knots.landmark[knots.before].tolist() == landmark.tolist()
-    assert not bool(knots.is_last[knots.before].any())
+@pytest.mark.parametrize("scale", [0.5, 1.0])
+def test_the_drift_grows_with_the_root_of_the_way_and_has_an_end(scale):
+    knots = 200
+    terms = drift_terms(knots, CONFIG, scale, torch.zeros(1, dtype=F64))
+    problem = Problem({"drift": Variable(8, euclidean)}, terms)
+    normal = DenseBackend().assemble(problem, {"drift": torch.zeros(knots, 8, dtype=F64)})
+    covariance = torch.linalg.inv(normal.hessian[0])
 
+    def spread(knot: int, other: int, part: int) -> float:
+        a, b = 8 * knot + part, 8 * other + part
+        change = covariance[a, a] + covariance[b, b] - 2 * covariance[a, b]
+        return float(change.sqrt())
 
-def test_one_view_alone_has_two_knots():
-    knots = place_knots(torch.zeros(1, dtype=F64), torch.zeros(1, dtype=torch.int64), CONFIG)
-    assert len(knots.landmark) == 2 and float(knots.share[0]) in (0.0, 1.0)
-
-
-def test_the_drift_grows_with_the_square_root_of_the_way():
-    distance = torch.tensor([-16.0, 0.0], dtype=F64)
-    knots = place_knots(distance, torch.zeros(2, dtype=torch.int64), CONFIG)
-    zero = torch.zeros(len(knots.landmark), 3, dtype=F64)
-    problem = Problem(
-        {"drift": Variable(3, euclidean, group=knots.landmark)}, drift_terms(knots, CONFIG)
-    )
-    covariance = DenseBackend().assemble(problem, {"drift": zero}).covariance()[0]
-    sigma = covariance.diagonal().reshape(-1, 3)[:, 0].sqrt()
-    anchor = int(knots.anchor[0])
-    assert float(sigma[anchor]) < 2e-3
-    for steps in (1, 4):
-        expected = CONFIG.sigma_m * (steps * CONFIG.knot_m) ** 0.5
-        assert float(sigma[anchor - steps]) == pytest.approx(expected, rel=1e-3)
+    for part, sigma in ((0, CONFIG.sigma_m), (4, CONFIG.sigma_rad)):
+        # Over a short way it is a walk; of what it was nothing is left in the end.
+        walk = scale * sigma * CONFIG.knot_m**0.5
+        assert spread(50, 51, part) == pytest.approx(walk, rel=0.01)
+        assert spread(50, 54, part) == pytest.approx(2 * walk, rel=0.02)
+        far = scale * sigma * (CONFIG.forget_m / 2) ** 0.5
+        for knot in (0, 100, 199):
+            own = covariance[8 * knot + part, 8 * knot + part].sqrt()
+            assert float(own) == pytest.approx(far, rel=1e-3)
+    # How the camera stands in the car does not drift with the poses.
+    assert float(covariance[6, 6].sqrt()) == pytest.approx(CONFIG.slip_sigma_rad, rel=1e-3)
+    assert spread(0, 199, 6) < 0.05 * CONFIG.slip_sigma_rad

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_mode, group_sum
+from crowdmap_torch.drift_course import DrivePath, drive_path
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.pose_drift import closest_view
 from crowdmap_torch.sign_fit import (
@@ -59,7 +60,7 @@ class SignTriangulationConfig:
     """Tracklets whose centre has a larger standard deviation in any direction are pruned."""
     doubtful_frames: int = 10
     """Tracklets with fewer views in agreement must be better placed than others: false detections come in short runs."""
-    max_doubtful_sigma_m: float = 0.8
+    max_doubtful_sigma_m: float = 0.5
     """Largest standard deviation of those."""
     size_m: tuple[float, float] = (0.1, 8.0)
     """Smallest and largest plausible width and height."""
@@ -111,9 +112,11 @@ def triangulate_signs(
         return _no_signs(journey), SignReport(reason, tracklets, _per_detection(journey))
     label, sign = tracklets.label[rows].unique(return_inverse=True)
     views = _views(journey, tracklets, rows, sign)
-    fit, scale = _fit(views, shape[label], config)
+    drive = drive_path(journey, config.fit.course, config.fit.drift)
+    start, scale = _begin(views, shape[label], config)
+    fit = _fit(views, shape[label], start, scale, drive, config)
 
-    t_s = (journey.t_ns - journey.t_ns[0]).to(journey.T_world_camera) * 1e-9
+    t_s = (journey.t_ns - journey.t_ns[0]).to(fit.size) * 1e-9
     group = rejoin(views, t_s[views.frame], fit, shape[label], config.rejoin)
     joined = group != torch.arange(len(label), device=group.device)
     if bool(joined.any()):
@@ -122,11 +125,13 @@ def triangulate_signs(
         # Second detections of a frame stay with the tracklet that is given up.
         still = tracklets.label[rows] == label[group][views.sign]
         rows, views = rows[still], views[still]
-        fit = replace(fit, error_sq=fit.error_sq[still])
         label, new_row = label[~joined], (~joined).cumsum(0) - 1
         views = replace(views, sign=new_row[group][views.sign])
-        again = torch.isin(views.sign, new_row[group[joined]])
-        fit, scale = _refit(views, again, shape[label], fit, scale, ~joined, config)
+        again = torch.zeros_like(label, dtype=torch.bool).index_fill(
+            0, new_row[group[joined]], True
+        )
+        start, scale = _begin_again(views, again, shape[label], start, scale, ~joined, config)
+        fit = _fit(views, shape[label], start, scale, drive, config)
 
     fate = _fates(views, fit, scale, config)
     reason[label] = fate
@@ -176,10 +181,10 @@ def _views(
     )
 
 
-def _fit(
+def _begin(
     views: SignViews, shape: Int[Tensor, " n"], config: SignTriangulationConfig
-) -> tuple[SignFit, Float[Tensor, " n"]]:
-    """Signs fitted from several starts without the drift, then from the best one with it; and their noise scales."""
+) -> tuple[SignStart, Float[Tensor, " n"]]:
+    """Signs fitted one by one from several starts, of each the best; and their noise scales."""
     n = len(shape)
     few = views[_thinned(views, config.start_views)]
     m = len(few)
@@ -201,8 +206,37 @@ def _fit(
     view = choice[few.sign] * m + torch.arange(m, device=shape.device)
     most = config.fit.max_noise_scale
     scale = robust_noise_scale(coarse.error_sq[view], few.sign, n, most)
-    start = SignStart(coarse.T_world_sign[best], coarse.size[best])
-    return fit_signs(views, shape, start, facing, scale, config.fit), scale
+    return SignStart(coarse.start.T_world_sign[best], coarse.start.size[best]), scale
+
+
+def _begin_again(
+    views: SignViews,
+    again: Bool[Tensor, " n"],
+    shape: Int[Tensor, " n"],
+    start: SignStart,
+    scale: Float[Tensor, " before"],
+    kept: Bool[Tensor, " before"],
+    config: SignTriangulationConfig,
+) -> tuple[SignStart, Float[Tensor, " n"]]:
+    """The beginnings of the signs `kept`, those of the signs `again` anew."""
+    mine = views[again[views.sign]]
+    sign, compact = mine.sign.unique(return_inverse=True)
+    new, new_scale = _begin(replace(mine, sign=compact), shape[sign], config)
+    T, size = start.T_world_sign[kept], start.size[kept]
+    merged = SignStart(T.index_put((sign,), new.T_world_sign), size.index_put((sign,), new.size))
+    return merged, scale[kept].index_put((sign,), new_scale)
+
+
+def _fit(
+    views: SignViews,
+    shape: Int[Tensor, " n"],
+    start: SignStart,
+    scale: Float[Tensor, " n"],
+    drive: DrivePath,
+    config: SignTriangulationConfig,
+) -> SignFit:
+    facing = against_the_drive(views, len(shape))
+    return fit_signs(views, shape, start, facing, scale, drive, config.fit)
 
 
 def _thinned(views: SignViews, most: int) -> Bool[Tensor, " m"]:
@@ -216,32 +250,6 @@ def _thinned(views: SignViews, most: int) -> Bool[Tensor, " m"]:
     last = torch.ones_like(share, dtype=torch.bool)
     last[:-1] = (share[1:] != share[:-1]) | (rank[1:] == 0)
     return torch.zeros_like(last).index_put((order,), last)
-
-
-def _refit(
-    views: SignViews,
-    again: Bool[Tensor, " m"],
-    shape: Int[Tensor, " n"],
-    fit: SignFit,
-    scale: Float[Tensor, " before"],
-    kept: Bool[Tensor, " before"],
-    config: SignTriangulationConfig,
-) -> tuple[SignFit, Float[Tensor, " n"]]:
-    """The fit of the signs `kept`, those of the views `again` anew."""
-    sign, compact = views.sign[again].unique(return_inverse=True)
-    new, new_scale = _fit(replace(views[again], sign=compact), shape[sign], config)
-
-    def merged(old: Tensor, part: Tensor) -> Tensor:
-        return old[kept].index_put((sign,), part)
-
-    result = SignFit(
-        T_world_sign=merged(fit.T_world_sign, new.T_world_sign),
-        size=merged(fit.size, new.size),
-        cost=merged(fit.cost, new.cost),
-        covariance=merged(fit.covariance, new.covariance),
-        error_sq=fit.error_sq.index_put((again.nonzero()[:, 0],), new.error_sq),
-    )
-    return result, merged(scale, new_scale)
 
 
 def _fates(
@@ -288,7 +296,7 @@ def _parallax(views: SignViews, fit: SignFit, counts: Bool[Tensor, " m"]) -> Flo
     across = torch.linalg.cross(ray, ray[closest][views.sign]).norm(dim=-1)
     angle = torch.atan2(across, (ray * ray[closest][views.sign]).sum(-1))
     angle = torch.where(counts, angle, torch.zeros_like(angle))
-    return torch.zeros_like(fit.cost).scatter_reduce(0, views.sign, angle, "amax")
+    return torch.zeros_like(fit.size[:, 0]).scatter_reduce(0, views.sign, angle, "amax")
 
 
 def _signs(
@@ -320,7 +328,7 @@ def _signs(
         covariance=fit.covariance,
         journey=none,
         tracklet=label,
-        frame=views.frame[closest_view(away, views.sign)],
+        frame=fit.frame,
         n_journeys=torch.ones_like(label),
         n_observations=group_sum(agrees.long(), views.sign, n),
         first_seen_ns=first.scatter_reduce(0, views.sign, t_ns, "amin"),

@@ -33,7 +33,7 @@ from crowdmap_torch.stages.signs import (
     SignTriangulationConfig,
     triangulate_signs,
 )
-from crowdmap_torch.tables import Journey, Signs, Tracklets
+from crowdmap_torch.tables import Journey, Signs, SurveySigns, Tracklets
 
 CONFIG = SignTriangulationConfig()
 ALL_SHAPES = list(range(len(polygon.SHAPES)))
@@ -86,8 +86,10 @@ def test_the_table_says_where_it_comes_from(street, street_map):
     p = street.journey.T_world_camera[:, :3, 3]
     for i, sign in enumerate(nearest.tolist()):
         frames = street.journey.signs.frame[street.sign == sign]
-        away = (p[frames] - signs.center_world[i]).norm(dim=-1)
-        assert int(signs.frame[i]) == int(frames[away.argmin()])
+        away = (p - signs.center_world[i]).norm(dim=-1)
+        # The closest approach is seen, if not detected: the car goes on for a few metres after the last detection.
+        assert frames.max() <= signs.frame[i] <= frames.max() + 12
+        assert away[signs.frame[i]] <= away[frames].min()
         assert int(signs.first_seen_ns[i]) == int(street.journey.t_ns[frames.min()])
         assert int(signs.last_seen_ns[i]) == int(street.journey.t_ns[frames.max()])
         assert int(signs.type[i]) == sign % 3
@@ -227,24 +229,64 @@ def test_detections_without_a_tracklet_are_left_alone(street):
     assert len(signs) == 0 and bool((report.tracklets.label == -1).all())
 
 
-@pytest.mark.timeout(120)
-def test_real_signs_are_where_lidar_found_them(real_data):
-    """Four KITTI drives, boxes marked in real images: at least 24 of 26, median 0.32 m, mean 0.55 m."""
+@pytest.fixture(scope="module")
+def real_drives(real_data) -> list[tuple[Journey, SurveySigns, torch.Tensor]]:
+    """Four KITTI drives with boxes marked in real images, the survey, and which of its signs count."""
     folder = real_data("kitti-signs")
     eligible = json.loads((folder / "eligible.json").read_text())
-    distances = []
+    drives = []
     for name, wanted in eligible.items():
         (journey,) = load_dataset(folder / name).journeys
         survey = read_survey(folder / name / "survey")
-        signs, _ = mapped(journey)
-        distance = torch.cdist(survey.signs.center_world, signs.center_world)
+        rows = torch.tensor([survey.sign_id.index(sign) for sign in wanted])
+        drives.append((journey, survey.signs, rows))
+    return drives
+
+
+def real_errors(drives, push: list[torch.Tensor]) -> torch.Tensor:
+    """Distances of mapped from surveyed signs, poses pushed about and the push at each closest approach taken off."""
+    distances = []
+    for (journey, survey, wanted), offset in zip(drives, push, strict=True):
+        T = journey.T_world_camera.clone()
+        T[:, :3, 3] += offset
+        signs, _ = mapped(replace(journey, T_world_camera=T))
+        distance = torch.cdist(survey.center_world, signs.center_world - offset[signs.frame])
         row, column = gated_matching(distance.square(), 2.0**2)
-        distances += [
-            float(distance[r, c])
-            for r, c in zip(row.tolist(), column.tolist(), strict=True)
-            if survey.sign_id[r] in wanted
-        ]
-    found = torch.tensor(distances)
-    assert len(found) >= 24
-    assert float(found.median()) <= 0.32
-    assert float(found.mean()) <= 0.55
+        counts = torch.isin(row, wanted)
+        distances.append(distance[row[counts], column[counts]])
+    return torch.cat(distances)
+
+
+def unmoved(drives) -> list[torch.Tensor]:
+    return [torch.zeros(journey.frame_count, 3, dtype=F64) for journey, _, _ in drives]
+
+
+def shaken(drives, seed: int, *, sigma: float = 0.2, length_m: float = 150.0) -> list[torch.Tensor]:
+    """Ornstein-Uhlenbeck drift of positions over the way [m]."""
+    generator = torch.Generator().manual_seed(seed)
+    pushes = []
+    for journey, _, _ in drives:
+        p = journey.T_world_camera[:, :3, 3]
+        keep = torch.exp(-(p[1:] - p[:-1]).norm(dim=-1) / length_m)[:, None]
+        push = sigma * torch.randn(len(p), 3, dtype=F64, generator=generator)
+        for i in range(1, len(p)):
+            push[i] = keep[i - 1] * push[i - 1] + (1 - keep[i - 1] ** 2).sqrt() * push[i]
+        pushes.append(push)
+    return pushes
+
+
+@pytest.mark.timeout(120)
+def test_real_signs_are_where_lidar_found_them(real_drives):
+    """At least 25 of 26, median 0.26 m, mean 0.42 m."""
+    found = real_errors(real_drives, unmoved(real_drives))
+    assert len(found) >= 25
+    assert float(found.median()) <= 0.26
+    assert float(found.mean()) <= 0.42
+
+
+@pytest.mark.timeout(120)
+def test_real_signs_stay_where_they_are_when_poses_drift(real_drives):
+    found = real_errors(real_drives, shaken(real_drives, seed=0))
+    assert len(found) >= 25
+    assert float(found.median()) <= 1.1 * 0.26
+    assert float(found.mean()) <= 1.1 * 0.42
