@@ -1,0 +1,1 @@
+"""Times and figures beside other ways to do the same; run by scripts/benchmark.py."""
