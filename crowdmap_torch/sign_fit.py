@@ -38,6 +38,7 @@ from crowdmap_torch.sign_view import (
     drifting_sign_view,
     drifting_sign_view_jacobian,
     sign_habit,
+    sign_habit_jacobian,
     sign_view,
     sign_view_jacobian,
 )
@@ -282,6 +283,7 @@ def _problem(
         (("sign", own), ("size", own)),
         (facing, torch.full_like(start.size, config.typical_size_m)),
         weight=(1 / sigma).expand(len(own), 5),
+        jacobian=sign_habit_jacobian,
     )
     values = {"sign": start.T_world_sign, "size": start.size}
     return Problem(variables, terms, group_count=len(own)), values
@@ -336,11 +338,16 @@ def _likely_scale(
     problem: Problem, values: Mapping[str, Tensor], knots: int, config: DriftConfig
 ) -> float:
     """The multiple of the usual drift under which the views are likeliest (marginal likelihood, to second order)."""
+    backend = BandBackend("drift")
+    whole = backend.assemble(problem, values)
+    chain = drift_terms(knots, config, 1.0, values["drift"])
+    alone = backend.assemble(replace(problem, terms=chain), values)
     evidence = []
     for scale in config.scales:
-        terms = drift_terms(knots, config, scale, values["drift"])
-        scaled = replace(problem, terms={**problem.terms, **terms})
-        minus_log = BandBackend("drift").assemble(scaled, values).log_evidence()
+        # The chain of the poses' six components is in the whole once, with the scale of one.
+        more = torch.zeros_like(values["drift"][0])
+        more[:6] = scale**-2 - 1
+        minus_log = whole.plus(alone, more, values["drift"]).log_evidence()
         # The chain's own normalisation, and how usual such a scale is.
         unusual = (math.log(scale) / config.sigma_log_scale) ** 2 / 2
         evidence.append(float(minus_log) + 6 * knots * math.log(scale) + unusual)

@@ -105,6 +105,35 @@ def sign_habit(
     return torch.stack((right, R[2, 0], R[2, 2], log_size[0], log_size[1]))
 
 
+def sign_habit_jacobian(
+    T_world_sign: Float[Tensor, "n 4 4"],
+    size: Float[Tensor, "n 2"],
+    facing: Float[Tensor, "n 3"],
+    typical_size: Float[Tensor, "n 2"],
+) -> tuple[Float[Tensor, "n 5"], tuple[Tensor, Tensor]]:
+    """`sign_habit` and its Jacobians by sign pose and relative size."""
+    R = T_world_sign[:, :3, :3]
+    across = (R * facing[..., None]).sum(1)
+    up = R[:, 2]
+    log_size = (size / typical_size).log()
+    habit = torch.cat((across[:, :1], up[:, :1], up[:, 2:], log_size), dim=-1)
+    zero = torch.zeros_like(up[:, 0])
+    # A turn by w takes the axes x and z to x + w_z y - w_y z and z + w_y x - w_x y.
+    by_turn = torch.stack(
+        (
+            torch.stack((zero, -across[:, 2], across[:, 1]), dim=-1),
+            torch.stack((zero, -up[:, 2], up[:, 1]), dim=-1),
+            torch.stack((-up[:, 1], up[:, 0], zero), dim=-1),
+        ),
+        dim=1,
+    )
+    by_size = torch.eye(5, 2, dtype=size.dtype, device=size.device).roll(3, 0)
+    return habit, (
+        torch.nn.functional.pad(by_turn, (3, 0, 0, 2)),
+        by_size.expand(len(size), 5, 2),
+    )
+
+
 def corner_errors(
     T_world_camera: Float[Tensor, "m 4 4"],
     T_world_sign: Float[Tensor, "m 4 4"],
@@ -112,18 +141,23 @@ def corner_errors(
     template: Float[Tensor, "m c 2"],
     observation: Float[Tensor, "m c 3 3"],
 ) -> tuple[Float[Tensor, "m e"], tuple[Tensor, Tensor, Tensor]]:
-    """Pixel errors of all corners of every detection, and their Jacobians by camera, sign and size."""
-    m, c = template.shape[:2]
+    """Pixel errors of all corners of every detection, and their Jacobians by camera, sign and relative size.
 
-    def for_corners(x: Tensor) -> Tensor:
-        return x[:, None].expand(m, c, *x.shape[1:]).flatten(0, 1)
-
-    error, (by_pose, by_sign, by_size) = residuals.sign_reprojection_jacobian(
-        for_corners(T_world_camera),
-        for_corners(T_world_sign),
-        for_corners(size),
-        template.flatten(0, 1),
-        observation.flatten(0, 1),
-    )
-    by_pose, by_sign, by_size = (J.reshape(m, 2 * c, -1) for J in (by_pose, by_sign, by_size))
-    return error.reshape(m, 2 * c), (by_pose, by_sign, by_size)
+    `residuals.sign_reprojection_jacobian` for corners that share a camera and a sign.
+    """
+    R_camera, R_sign = T_world_camera[:, :3, :3], T_world_sign[:, :3, :3]
+    corner = torch.nn.functional.pad(template * size[:, None], (0, 1))
+    offset = T_world_sign[:, None, :3, 3] - T_world_camera[:, None, :3, 3]
+    in_camera = (corner @ R_sign.mT + offset) @ R_camera
+    u, v, depth = (observation @ in_camera[..., None])[..., 0].unbind(-1)
+    is_ahead = depth > residuals.MIN_DEPTH
+    depth = torch.where(is_ahead, depth, residuals.MIN_DEPTH)[..., None]
+    error = torch.stack((u, v), dim=-1) / depth
+    by_depth = (error * is_ahead[..., None])[..., None] * observation[..., 2:, :]
+    by_camera = ((observation[..., :2, :] - by_depth) / depth[..., None]).flatten(1, 2)
+    by_world = by_camera @ R_camera.mT
+    in_camera, corner = (x.repeat_interleave(2, dim=1) for x in (in_camera, corner))
+    by_body = by_world @ R_sign
+    by_pose = torch.cat((-by_world, torch.linalg.cross(by_camera, in_camera)), dim=-1)
+    by_sign = torch.cat((by_world, torch.linalg.cross(corner, by_body)), dim=-1)
+    return error.flatten(1), (by_pose, by_sign, by_body[..., :2] * corner[..., :2])

@@ -1,8 +1,15 @@
-"""One drive as it happens (section IV): a causal mapper that takes one frame at a time."""
+"""One drive as it happens (section IV): a causal mapper that takes one frame at a time.
+
+A step links the frame's detections and follows the road: a hundredth of a second. What takes longer, fitting the
+signs and lanes that went out of sight, is done beside the drive by a thread of its own, and comes out a fixed number of
+frames later: the same frames give the same results in the same steps, however fast they come.
+"""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,12 +32,17 @@ from crowdmap_torch.tables import (
     Signs,
     Tracklets,
     concatenate,
+    concatenate_lanes,
 )
 
 MAX_OPEN_FRAMES = 1500
 """A landmark in view for longer is mapped from its latest frames: a car may stand at a light for an hour."""
-LANE_FLUSH_FRAMES = 150
+SIGN_STRETCH_FRAMES = 75
+"""Signs that went out of sight are mapped every so many frames: together they say more of the poses' drift."""
+LANE_STRETCH_FRAMES = 150
 """Lane tracklets do not end where a marker goes on: what they showed is mapped every so many frames."""
+MAPPING_FRAMES = 30
+"""What was mapped comes out so many frames after its stretch ended: the mapping has that long to be done."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +56,18 @@ class StepResult:
     road: RoadEstimate
     """The road under the car, one row."""
     signs: Signs | None
-    """Signs whose tracklets ended: they are out of sight. `frame` counts from the drive's start."""
+    """Signs that went out of sight some frames ago. `frame` counts from the drive's start."""
     lanes: Lanes | None
-    """Lane pieces of the last stretch, when one was finished."""
+    """Lane pieces of the last stretch, some frames after it was finished."""
+
+
+@dataclass(frozen=True)
+class _Promise:
+    """What a stretch showed, mapped when it is due."""
+
+    due: int
+    """The step in which it comes out."""
+    result: Callable[[], Signs | Lanes]
 
 
 class SingleJourneyMapper:
@@ -66,6 +87,8 @@ class SingleJourneyMapper:
         self._signs = SignAssociator(config.sign_association)
         self._lanes = LaneAssociator(config.lane_association)
         self._road = RoadTracker(rig, config.road)
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="mapping")
+        self._promised: list[_Promise] = []
         self._next = 0
         self._parts: list[Journey] = []
         self._sign_labels: list[Tensor] = []
@@ -94,18 +117,24 @@ class SingleJourneyMapper:
         self._sign_shifts.append(sign_shift)
         self._lane_labels.append(lane_label)
         self._roads.append(road)
-        signs = self._ended_signs()
-        lanes = self._finished_lanes()
+        if self._next % SIGN_STRETCH_FRAMES == 0:
+            self._map_signs(self._ended_signs())
+        if self._next - self._mapped_lanes >= LANE_STRETCH_FRAMES:
+            self._map_lanes()
         self._forget()
+        due = [p for p in self._promised if p.due <= self._next]
+        self._promised = self._promised[len(due) :]
+        signs, lanes = _collected(due)
         return StepResult(sign_label, lane_label, road, signs, lanes)
 
     @torch.no_grad()
     def finish(self) -> tuple[Signs | None, Lanes | None]:
-        """What was still in sight when the drive ended."""
-        signs = self._map_signs(self._held_labels())
-        lanes = self._map_lanes()
+        """What had not come out yet, and what was still in sight when the drive ended."""
+        self._map_signs(self._held_signs())
+        self._map_lanes()
+        signs, lanes = _collected(self._promised)
         self._parts, self._sign_labels, self._sign_shifts = [], [], []
-        self._lane_labels, self._roads = [], []
+        self._lane_labels, self._roads, self._promised = [], [], []
         return signs, lanes
 
     def state_dict(self) -> dict[str, object]:
@@ -123,6 +152,7 @@ class SingleJourneyMapper:
                 list(self._roads),
             ),
             "mapped_lanes": self._mapped_lanes,
+            "promised": [(p.due, p.result()) for p in self._promised],
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -135,65 +165,62 @@ class SingleJourneyMapper:
         self._parts, self._sign_labels, self._sign_shifts = parts, labels, shifts
         self._lane_labels, self._roads = lane_labels, roads
         self._mapped_lanes = state["mapped_lanes"]
+        self._promised = [_Promise(due, lambda made=made: made) for due, made in state["promised"]]
 
-    def _held_labels(self) -> set[int]:
-        return {label for part in self._sign_labels for label in part.tolist() if label >= 0}
+    def _held_signs(self) -> Int[Tensor, " n"]:
+        """Tracklets of signs that were not mapped yet."""
+        label = torch.cat([torch.zeros(0, dtype=torch.int64), *self._sign_labels]).unique()
+        return label[label >= 0]
 
-    def _ended_signs(self) -> Signs | None:
-        """Signs whose tracklets cannot be continued any more."""
-        oldest = self._next - 1 - self.config.sign_association.window_frames
-        if oldest < 0:
-            return None
-        index = len(self._parts) - 1 - self.config.sign_association.window_frames
-        if index < 0:
-            return None
-        open_labels = set(self._signs.active.label.tolist())
-        last_seen = {int(label) for label in self._sign_labels[index].tolist() if label >= 0}
-        seen_since = {
-            int(label) for part in self._sign_labels[index + 1 :] for label in part.tolist()
-        }
-        ended = (last_seen - seen_since) | (self._held_labels() - open_labels - seen_since)
-        return self._map_signs(ended)
+    def _ended_signs(self) -> Int[Tensor, " n"]:
+        """Those of them that cannot be continued any more."""
+        window = self.config.sign_association.window_frames
+        recent = torch.cat(self._sign_labels[-window - 1 :])
+        held = self._held_signs()
+        return held[~torch.isin(held, recent)]
 
-    def _map_signs(self, labels: set[int]) -> Signs | None:
-        if not labels:
-            return None
+    def _map_signs(self, wanted: Int[Tensor, " n"]) -> None:
+        """Has the signs of tracklets mapped; a sign is mapped once, so their detections are taken off."""
+        if not len(wanted):
+            return
         label, shift = torch.cat(self._sign_labels), torch.cat(self._sign_shifts)
-        journey = joined(self._parts)
-        wanted = torch.tensor(sorted(labels), dtype=torch.int64)
-        place = torch.searchsorted(wanted, label).clamp_max(len(wanted) - 1)
-        of_wanted = wanted[place] == label
-        own = torch.where(of_wanted, place, -1)
-        # A sign is mapped once: its detections are taken off.
+        is_wanted = torch.isin(label, wanted)
+        own = torch.where(is_wanted, torch.searchsorted(wanted, label), -1)
         self._sign_labels = list(
-            torch.where(of_wanted, -1, label).split([len(part) for part in self._sign_labels])
+            torch.where(is_wanted, -1, label).split([len(part) for part in self._sign_labels])
         )
-        tracklets = Tracklets(own, len(wanted), shift)
-        signs, _ = triangulate_signs(journey, tracklets, self.config.sign_triangulation)
-        first = self._next - len(self._parts)
-        return replace(signs, frame=signs.frame + first, tracklet=wanted[signs.tracklet])
+        tracklets, parts = Tracklets(own, len(wanted), shift), list(self._parts)
+        first = self._next - len(parts)
 
-    def _finished_lanes(self) -> Lanes | None:
-        if self._next - self._mapped_lanes < LANE_FLUSH_FRAMES:
-            return None
-        lanes = self._map_lanes()
-        self._mapped_lanes = self._next
-        return lanes
+        def mapped() -> Signs:
+            signs, _ = triangulate_signs(joined(parts), tracklets, self.config.sign_triangulation)
+            return replace(signs, frame=signs.frame + first, tracklet=wanted[signs.tracklet])
 
-    def _map_lanes(self) -> Lanes | None:
+        self._promise(mapped)
+
+    def _map_lanes(self) -> None:
+        """Has the lanes of the last stretch mapped."""
         first = self._next - len(self._parts)
         # Half a stretch of overlap, so that pieces meet.
-        start = max(self._mapped_lanes - LANE_FLUSH_FRAMES // 2 - first, 0)
-        parts = self._parts[start:]
+        start = max(self._mapped_lanes - LANE_STRETCH_FRAMES // 2 - first, 0)
+        self._mapped_lanes = self._next
+        parts, roads = self._parts[start:], self._roads[start:]
         if not parts:
-            return None
-        label = torch.cat(self._lane_labels[start:])
-        used, own = torch.unique(label, return_inverse=True)
-        road = concatenate(self._roads[start:])
-        lanes, _ = reconstruct_lanes(
-            joined(parts), Tracklets(own, len(used)), road, self.config.lane
-        )
-        return replace(lanes, frame=lanes.frame + first + start, tracklet=used[lanes.tracklet])
+            return
+        used, own = torch.unique(torch.cat(self._lane_labels[start:]), return_inverse=True)
+
+        def mapped() -> Lanes:
+            tracklets = Tracklets(own, len(used))
+            lanes, _ = reconstruct_lanes(
+                joined(parts), tracklets, concatenate(roads), self.config.lane
+            )
+            return replace(lanes, frame=lanes.frame + first + start, tracklet=used[lanes.tracklet])
+
+        self._promise(mapped)
+
+    def _promise(self, mapped: Callable[[], Signs | Lanes]) -> None:
+        result = self._beside.submit(mapped).result
+        self._promised.append(_Promise(self._next + MAPPING_FRAMES, result))
 
     def _forget(self) -> None:
         """Drops the frames that nothing in sight and no unfinished stretch needs."""
@@ -203,7 +230,7 @@ class SingleJourneyMapper:
                 needed = index
                 break
         first = self._next - len(self._parts)
-        stretch = max(self._mapped_lanes - LANE_FLUSH_FRAMES // 2 - first, 0)
+        stretch = max(self._mapped_lanes - LANE_STRETCH_FRAMES // 2 - first, 0)
         drop = max(min(needed, stretch), len(self._parts) - MAX_OPEN_FRAMES, 0)
         for held in (
             self._parts,
@@ -213,6 +240,17 @@ class SingleJourneyMapper:
             self._roads,
         ):
             del held[:drop]
+
+
+def _collected(promises: list[_Promise]) -> tuple[Signs | None, Lanes | None]:
+    """The signs and the lanes of promises; None where there was none."""
+    made = [promise.result() for promise in promises]
+    signs = [one for one in made if isinstance(one, Signs)]
+    lanes = [one for one in made if isinstance(one, Lanes)]
+    return (
+        concatenate(signs) if signs else None,
+        concatenate_lanes(lanes) if lanes else None,
+    )
 
 
 def frame_of(journey: Journey, index: int) -> Journey:

@@ -8,7 +8,7 @@ with the length of the path.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -197,6 +197,24 @@ class BandNormalEquations:
         return (
             torch.full_like(self.own_gradient, UNHELD_FLOOR),
             torch.full_like(self.path_gradient, UNHELD_FLOOR),
+        )
+
+    def plus(
+        self,
+        path_alone: BandNormalEquations,
+        factor: Float[Tensor, " d"],
+        value: Float[Tensor, "p d"],
+    ) -> BandNormalEquations:
+        """The model with squares of the path's own added, each component of the blocks times its factor.
+
+        `path_alone` has no landmarks, residuals that are linear in the path's `value`, and components that do not mix.
+        """
+        more = factor.repeat(len(value)) * path_alone.path_gradient
+        return replace(
+            self,
+            cost=self.cost + more @ value.flatten() / 2,
+            path=self.path + factor[:, None] * path_alone.path,
+            path_gradient=self.path_gradient + more,
         )
 
     def columns(self) -> Int[Tensor, "n w"]:

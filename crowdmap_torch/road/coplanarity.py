@@ -17,6 +17,8 @@ from torch import Tensor
 from crowdmap_torch.geometry.plane import harmonic_mean_singular_value, smallest_singular_value
 from crowdmap_torch.road.level import Level
 
+NO_STEP = 1e-7
+"""Newton steps below this end the search [rad]."""
 COSTS = {
     "smallest_singular_value": smallest_singular_value,
     "harmonic_mean": harmonic_mean_singular_value,
@@ -46,7 +48,7 @@ class CoplanarityConfig:
     points_down: tuple[float, ...] = (0.1, 0.15, 0.225, 0.35)
     """Likewise, below the calibrated horizon."""
     iterations: int = 12
-    """Of damped Newton steps."""
+    """Most damped Newton steps."""
 
     def __post_init__(self) -> None:
         if self.cost not in COSTS:
@@ -190,6 +192,8 @@ def _minimise(
         bounded = eigenvalue.abs() + damping[:, None] * eigenvalue.abs().amax(-1, keepdim=True)
         step = -(V @ ((V.mT @ g[..., None])[..., 0] / bounded.clamp_min(1e-12))[..., None])[..., 0]
         step = step * (0.02 / step.norm(dim=-1, keepdim=True).clamp_min(0.02))
+        if bool((step.norm(dim=-1) < NO_STEP).all()):
+            break
         new = costs(x + step)
         better = new < value
         x = torch.where(better[:, None], x + step, x)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -97,6 +99,21 @@ def test_evidence_is_the_integral_of_the_model(along_a_path, dense):
     expected = dense.cost[0] + (torch.logdet(H) - g @ torch.linalg.solve(H, g)) / 2
     found = BandBackend("path").assemble(*along_a_path).log_evidence()
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+
+
+def test_more_of_the_path_is_as_if_it_were_weighted(along_a_path):
+    """Each component of the chain's squares can be weighted without a new linearisation."""
+    problem, values = along_a_path
+    problem.terms.pop("prior")
+    factor = torch.tensor([3.0, 0.0, 8.0], dtype=F64)
+    step = problem.terms["step"]
+    heavy = replace(step, weight=(1 + factor).sqrt().expand(len(step), 3))
+    backend = BandBackend("path")
+    expected = backend.assemble(replace(problem, terms={**problem.terms, "step": heavy}), values)
+    alone = backend.assemble(replace(problem, terms={"step": step}), values)
+    found = backend.assemble(problem, values).plus(alone, factor, values["path"])
+    torch.testing.assert_close(found.path, expected.path)
+    torch.testing.assert_close(found.log_evidence(), expected.log_evidence())
 
 
 def test_a_matrix_that_is_not_definite_is_a_step_not_solved(along_a_path):
