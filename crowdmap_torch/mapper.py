@@ -224,6 +224,8 @@ def first_map(
         heads = with_evidence(heads, journeys, associations, config.harvest)
         sure = existence(heads.n_journeys, passed, config.crowd.existence)
         heads = replace(heads, confidence=sure.to(heads.size))
+        # What a bad drive alone saw is nothing to look for.
+        tentative = tentative[crowd.journey_weight[tentative.journey] > 0]
         tentative = tentative[still_alone(tentative, made, associations)]
     return FirstMap(heads, lanes, tentative, crowd, associations, tuple(drifts), harvest)
 

@@ -180,7 +180,7 @@ def fit_curves(
     used = (matched.curve >= 0).nonzero()[:, 0]
     curve, station = matched.curve[used], matched.station[used]
     length = curves.length
-    weight = samples.weight[used] / _overlap(samples.owner[used], curve, station, len(curves))
+    weight = samples.weight[used] / overlap(samples.owner[used], curve, station, len(curves))
     weight = weight / (1 + (matched.lateral[used] / scale).square())
     count = _counts(length, spacing)
     # Where no sample lies the old course is kept, more or less.
@@ -269,7 +269,7 @@ def _counts(length: Float[Tensor, " n"], spacing: Float[Tensor, " n"]) -> Int[Te
     return (length / spacing).round().long().clamp_min(3) + 1
 
 
-def _overlap(
+def overlap(
     owner: Int[Tensor, " m"], curve: Int[Tensor, " m"], station: Float[Tensor, " m"], curves: int
 ) -> Float[Tensor, " m"]:
     """How many samples of the same owner share each sample's stretch of four metres."""

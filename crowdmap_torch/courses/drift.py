@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.courses.curves import Match, _overlap
+from crowdmap_torch.courses.curves import Match, overlap
 from crowdmap_torch.courses.samples import LaneSamples
 from crowdmap_torch.optim.banded import solve_banded
 
@@ -31,29 +31,10 @@ class DriftConfig:
     """Rounds of reweighting."""
 
 
-@dataclass(frozen=True)
-class LaneOffsets:
-    """How far from the common courses each journey sees the markers, at nodes along its way: observed minus common."""
-
-    journey: Int[Tensor, " k"]
-    """Not decreasing."""
-    frame: Int[Tensor, " k"]
-    """Frame index of the journey's pieces nearest to the node."""
-    station: Float[Tensor, " k"]
-    """Along the journey, ascending [m]."""
-    offset_world: Float[Tensor, "k 3"]
-    """Along a straight road only the part across it is seen; the rest stays near zero."""
-    weight: Float[Tensor, " k"]
-    """Metres of markers behind the node's value; zero where it is guessed from its neighbours."""
-
-    def __len__(self) -> int:
-        return len(self.journey)
-
-
 def journey_offsets(
     samples: LaneSamples, matched: Match, config: DriftConfig
-) -> tuple[LaneOffsets, Float[Tensor, "s 3"]]:
-    """Offsets at nodes along each journey, and the offset of every sample, matched or not.
+) -> Float[Tensor, "s 3"]:
+    """How far from the curves the journey of each sample sees the markers there, for samples matched or not.
 
     Each journey's offset is a chain of nodes under an Ornstein-Uhlenbeck prior, seen across the matched curves
     (sideways and in height). Samples that do not fit the rest of their journey lose their say, and a journey far off is
@@ -79,8 +60,8 @@ def journey_offsets(
     a, u = node[used], share[used]
     normal, lateral, height = matched.normal[used], matched.lateral[used], matched.height[used]
     curves = int(matched.curve.max()) + 1 if len(used) else 1
-    overlap = _overlap(line.owner[used], matched.curve[used], matched.station[used], curves)
-    base = line.weight[used] * 4.0 / overlap / config.noise_m**2  # a stretch is four metres
+    shared = overlap(line.owner[used], matched.curve[used], matched.station[used], curves)
+    base = line.weight[used] * 4.0 / shared / config.noise_m**2  # a stretch is four metres
     base = base / (config.noise_m / 0.1)  # neighbouring stretches of a marker err alike
     up = torch.zeros_like(normal[:, :1])
     across = torch.cat((normal, up), dim=1)
@@ -130,28 +111,4 @@ def journey_offsets(
             torch.cat((trust * torch.cat((base, base)), prior_weight * free[prior_owner])),
             3 * nodes,
         ).reshape(nodes, 3)
-    weight = offset.new_zeros(nodes)
-    weight = weight.index_add(0, a + (u > 0.5).long(), 4.0 / overlap)
-    node_station = low[owner_of_node] + spacing[owner_of_node] * (
-        torch.arange(nodes, device=a.device) - first[owner_of_node]
-    )
-    offsets = LaneOffsets(
-        journey=journeys[owner_of_node],
-        frame=_nearest_frame(samples, node, share, nodes),
-        station=node_station,
-        offset_world=offset,
-        weight=weight,
-    )
-    return offsets, (1 - share)[:, None] * offset[node] + share[:, None] * offset[node + 1]
-
-
-def _nearest_frame(
-    samples: LaneSamples, node: Int[Tensor, " s"], share: Float[Tensor, " s"], nodes: int
-) -> Int[Tensor, " k"]:
-    """Mean frame of the samples about each node; that of the node before where there is none."""
-    near = node + (share > 0.5).long()
-    number = torch.bincount(near, minlength=nodes)
-    total = torch.zeros_like(number).index_add(0, near, samples.frame)
-    mean = total // number.clamp_min(1)
-    known = torch.where(number > 0, torch.arange(nodes, device=node.device), 0).cummax(0).values
-    return mean[known]
+    return (1 - share)[:, None] * offset[node] + share[:, None] * offset[node + 1]

@@ -30,8 +30,6 @@ class LaneSamples:
     """Row of the piece; one of several where samples were merged."""
     station: Float[Tensor, " s"]
     """How far along its journey the sample lies [m], up to a constant of the journey."""
-    frame: Int[Tensor, " s"]
-    """Frame index of the piece."""
     track_of_piece: Int[Tensor, " n"]
 
     def __len__(self) -> int:
@@ -44,7 +42,6 @@ class LaneSamples:
             line=self.line[index],
             piece=self.piece[index],
             station=self.station[index],
-            frame=self.frame[index],
         )
 
     def moved(self, offset: Float[Tensor, "s 3"]) -> LaneSamples:
@@ -83,7 +80,6 @@ def sample_lanes(lanes: Lanes, spacing: float, *, few_observations: float) -> La
         line=line[order],
         piece=piece[order],
         station=station[order],
-        frame=lanes.frame[piece][order],
         track_of_piece=track,
     )
 
@@ -98,7 +94,6 @@ def merged(samples: LaneSamples, cell: float) -> tuple[LaneSamples, Int[Tensor, 
         line=line,
         piece=samples.piece[last],
         station=group_sum(samples.station, cell_of, len(line)) / number,
-        frame=samples.frame[last],
         track_of_piece=samples.track_of_piece,
     )
     return result, cell_of

@@ -1,53 +1,14 @@
-"""What stands behind the lanes of the map: pieces, tracklets and journeys, and the table of lanes with all of it."""
+"""The table of the map's lanes, with what stands behind each: pieces, journeys and their scatter."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
-from crowdmap_torch.clustering.groups import group_mode, group_sum
+from crowdmap_torch.clustering.groups import group_sum
 from crowdmap_torch.courses.curves import Curves, Match
 from crowdmap_torch.courses.samples import LaneSamples
 from crowdmap_torch.geometry import spline
-from crowdmap_torch.tables import ControlPoints, Lanes, Rows
-
-_MIN_LENGTH = 4.0
-"""A shorter run of a tracklet beside a lane is no support [m]."""
-
-
-@dataclass(frozen=True)
-class LaneSupport(Rows):
-    """Which tracklets run along which lanes of the map; a tracklet may stand in several rows. Sorted by all of it."""
-
-    journey: Int[Tensor, " r"]
-    tracklet: Int[Tensor, " r"]
-    lane: Int[Tensor, " r"]
-    length: Float[Tensor, " r"]
-    """Metres of the tracklet's pieces that lie on the lane, overlapping pieces counted each."""
-
-
-def lane_support(
-    lanes: Lanes, samples: LaneSamples, matched: Match, spacing: float
-) -> tuple[Int[Tensor, " n"], LaneSupport]:
-    """The lane of most of each piece (-1 for none), and the lanes of each tracklet."""
-    weight = torch.full_like(matched.station, spacing)
-    piece_lane = group_mode(matched.curve, weight, samples.piece, len(lanes))
-    used = matched.curve >= 0
-    count = int(matched.curve.max()) + 1 if bool(used.any()) else 1
-    key, group = torch.unique(
-        samples.line.track[used] * count + matched.curve[used], return_inverse=True
-    )
-    length = group_sum(weight[used], group, len(key))
-    key, length = key[length >= _MIN_LENGTH], length[length >= _MIN_LENGTH]
-    track, lane = key // count, key % count
-    tracks = int(samples.track_of_piece.max()) + 1 if len(lanes) else 0
-    piece_of_track = torch.zeros(tracks, dtype=torch.int64, device=lane.device)
-    piece_of_track[samples.track_of_piece] = torch.arange(len(lanes), device=lane.device)
-    piece = piece_of_track[track]
-    return piece_lane, LaneSupport(lanes.journey[piece], lanes.tracklet[piece], lane, length)
+from crowdmap_torch.tables import ControlPoints, Lanes
 
 
 def lanes_table(

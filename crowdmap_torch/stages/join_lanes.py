@@ -15,7 +15,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering import chain
 from crowdmap_torch.clustering.chain import Chains
-from crowdmap_torch.clustering.groups import group_sum
+from crowdmap_torch.clustering.groups import group_mode, group_sum
 from crowdmap_torch.clustering.lines import LineSamples, owners_around
 from crowdmap_torch.clustering.ridge import RidgeConfig
 from crowdmap_torch.courses.curves import (
@@ -28,11 +28,11 @@ from crowdmap_torch.courses.curves import (
     match,
     select_curves,
 )
-from crowdmap_torch.courses.drift import DriftConfig, LaneOffsets, journey_offsets
+from crowdmap_torch.courses.drift import DriftConfig, journey_offsets
 from crowdmap_torch.courses.duplicates import covered_twice, crosses_longer, nearest_row
 from crowdmap_torch.courses.grow import drawn_out, supported_rows
 from crowdmap_torch.courses.samples import LaneSamples, merged, sample_lanes, stray_samples
-from crowdmap_torch.courses.support import LaneSupport, lane_support, lanes_table
+from crowdmap_torch.courses.support import lanes_table
 from crowdmap_torch.courses.trace import (
     TraceConfig,
     bridged,
@@ -103,14 +103,11 @@ class LaneJoinReport:
 
 @dataclass(frozen=True)
 class JoinedLanes:
-    """The lanes of the map, and what supports them."""
+    """The lanes of the map, and which pieces they are made of."""
 
     lanes: Lanes
     piece_lane: Int[Tensor, " n"]
     """Lane on which the most of each input piece lies; -1 for none."""
-    support: LaneSupport
-    """Every lane that some piece of a (journey, tracklet) runs along: the lanes its detections may show."""
-    offsets: LaneOffsets
     report: LaneJoinReport
 
 
@@ -128,7 +125,6 @@ def join_lanes(lanes: Lanes, config: LaneJoinConfig) -> JoinedLanes:
     stray = stray_samples(all_samples, beside=config.stray_m)
     samples, merged_as = merged(all_samples[~stray], config.sample_spacing_m)
     offset = torch.zeros_like(samples.line.point)
-    offsets: LaneOffsets | None = None
     chains = Chains(lanes.journey[:0], lanes.journey[:0], 0)
     point, direction = samples.line.point[:0], samples.line.direction[:0]
     for bandwidth, gate in zip(config.bandwidths_m, config.gates_m, strict=True):
@@ -139,7 +135,7 @@ def join_lanes(lanes: Lanes, config: LaneJoinConfig) -> JoinedLanes:
         matched = match(moved.line, curves, gate=gate)
         curves = _refit(moved.line, matched, curves, config)
         matched = match(moved.line, curves, gate=gate)
-        offsets, offset = journey_offsets(samples, _without(matched, -offset), config.drift)
+        offset = journey_offsets(samples, _without(matched, -offset), config.drift)
     gate = config.gates_m[-1]
     moved = samples.moved(-offset)
     joined = bridged(chains, point, direction, moved.line, config.trace)
@@ -148,7 +144,7 @@ def join_lanes(lanes: Lanes, config: LaneJoinConfig) -> JoinedLanes:
     for _ in range(2):
         matched = match(moved.line, curves, gate=gate)
         curves = _refit(moved.line, matched, curves, config)
-        offsets, offset = journey_offsets(samples, _without(matched, -offset), config.drift)
+        offset = journey_offsets(samples, _without(matched, -offset), config.drift)
         moved = samples.moved(-offset)
     curves = _grown(curves, moved.line, gate, config)
     curves, duplicates = _once(curves, moved.line, gate, config)
@@ -161,15 +157,11 @@ def join_lanes(lanes: Lanes, config: LaneJoinConfig) -> JoinedLanes:
     offset = offset[merged_as]
     matched = match(kept.moved(-offset).line, curves, gate=gate)
     table = lanes_table(curves, lanes, kept, matched, drift_sigma=config.drift.sigma_m)
-    piece_lane, support = lane_support(lanes, kept, matched, config.sample_spacing_m)
-    assert offsets is not None
     used = matched.curve >= 0
     before = _without(matched, -offset).lateral[used]
     return JoinedLanes(
         lanes=table,
-        piece_lane=piece_lane,
-        support=support,
-        offsets=offsets,
+        piece_lane=group_mode(matched.curve, kept.line.weight, kept.piece, len(lanes)),
         report=LaneJoinReport(
             samples=len(all_samples),
             stray_samples=int(stray.sum()),
@@ -180,15 +172,6 @@ def join_lanes(lanes: Lanes, config: LaneJoinConfig) -> JoinedLanes:
             rms_after_m=_rms(matched.lateral[used]),
         ),
     )
-
-
-def lane_offsets(lanes: Lanes, reference: Lanes, config: LaneJoinConfig) -> LaneOffsets:
-    """How far from reference lanes each journey sees the markers, along its way: what an alignment takes off."""
-    samples = sample_lanes(lanes, config.sample_spacing_m, few_observations=config.few_observations)
-    packed = reference.select(torch.arange(len(reference), device=reference.type.device))
-    curves = curves_of(packed.control.point_world, packed.control_count, packed.type)
-    matched = match(samples.line, curves, gate=config.gates_m[0])
-    return journey_offsets(samples, matched, config.drift)[0]
 
 
 def _through(chains: Chains, point: Float[Tensor, "n 3"], config: LaneJoinConfig) -> Curves:
@@ -324,12 +307,9 @@ def _along_travel(curves: Curves, samples: LineSamples, matched: Match) -> Curve
 def _nothing(lanes: Lanes, samples: LaneSamples) -> JoinedLanes:
     """The result where there are no pieces."""
     row = lanes.journey[:0]
-    value = lanes.confidence[:0]
     return JoinedLanes(
         lanes=lanes.select(row),
         piece_lane=torch.full_like(lanes.journey, -1),
-        support=LaneSupport(row, row, row, value),
-        offsets=LaneOffsets(row, row, value, samples.line.point[:0], value),
         report=LaneJoinReport(0, 0, 0, 0, 0.0, 0.0, 0.0),
     )
 

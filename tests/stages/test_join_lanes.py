@@ -14,7 +14,6 @@ from crowdmap_torch.stages.join_lanes import (
     JoinedLanes,
     LaneJoinConfig,
     join_lanes,
-    lane_offsets,
 )
 from crowdmap_torch.tables import LANE_TYPES, Lanes
 
@@ -158,7 +157,7 @@ def test_lanes_run_in_the_direction_of_travel(
     assert (centre.query(first)[1] < centre.query(last)[1]).all()
 
 
-def test_support_names_the_true_marker(world: lane_world.LaneWorld, joined: JoinedLanes) -> None:
+def test_pieces_name_the_true_marker(world: lane_world.LaneWorld, joined: JoinedLanes) -> None:
     truth = KDTree(np.concatenate(world.truth))
     marker = np.concatenate([np.full(len(t), k) for k, t in enumerate(world.truth)])
     lanes = joined.lanes
@@ -175,23 +174,6 @@ def test_support_names_the_true_marker(world: lane_world.LaneWorld, joined: Join
     used = right & (lane >= 0)
     # Pieces about the split, the merge and the change of type have two lanes to choose from.
     assert (of_lane[lane[used]] == world.marker_of_piece[used]).mean() > 0.96
-
-
-def test_support_lists_all_lanes_of_a_tracklet(
-    joined: JoinedLanes, world: lane_world.LaneWorld
-) -> None:
-    support = joined.support
-    pair = torch.stack((support.journey, support.tracklet, support.lane), dim=1)
-    assert len(torch.unique(pair, dim=0)) == len(pair)
-    # One row for the lane of every piece at least.
-    used = joined.piece_lane >= 0
-    of_piece = torch.stack(
-        (world.lanes.journey[used], world.lanes.tracklet[used], joined.piece_lane[used]), dim=1
-    )
-    listed = {tuple(row) for row in pair.tolist()}
-    named = {tuple(row) for row in of_piece.tolist()}
-    assert len(named - listed) <= 0.01 * len(named)
-    assert float(support.length.min()) >= 4.0
 
 
 def test_nothing_depends_on_row_order(world: lane_world.LaneWorld, joined: JoinedLanes) -> None:
@@ -329,7 +311,7 @@ def test_a_bad_journey_is_outvoted() -> None:
 def test_no_pieces_make_no_lanes() -> None:
     lanes = lanes_of([(line(0), "solid")], 1)
     joined = join_lanes(lanes.select(torch.zeros(0, dtype=torch.int64)), CONFIG)
-    assert len(joined.lanes) == len(joined.support) == len(joined.offsets) == 0
+    assert len(joined.lanes) == len(joined.piece_lane) == 0
 
 
 @pytest.mark.parametrize("length", [3.0, 20.0, 200.0])
@@ -339,9 +321,8 @@ def test_pieces_nobody_else_saw_make_no_lanes(length: float) -> None:
         lines, type=[-1, 0, 1], journey=[0, 1, 2], tracklet=[0, 0, 0], frame=[5, 5, 5]
     )
     joined = join_lanes(lanes, CONFIG)
-    assert len(joined.lanes) == len(joined.support) == 0
+    assert len(joined.lanes) == 0
     assert (joined.piece_lane == -1).all()
-    assert (joined.offsets.offset_world == 0).all()
 
 
 def test_two_control_points_are_a_piece() -> None:
@@ -353,29 +334,6 @@ def test_two_control_points_are_a_piece() -> None:
     assert joined.lanes.type.tolist() == [0]
     assert joined.lanes.control_count.tolist()[0] >= 4
     torch.testing.assert_close(ends(joined.lanes)[0][0], torch.zeros(3).double(), rtol=0, atol=1.5)
-
-
-def test_offsets_are_the_journeys_drifts(world: lane_world.LaneWorld) -> None:
-    # Against the true markers, the part across the road.
-    reference = lane_world.pieces(
-        [t[::16] for t in world.truth],
-        type=[LANE_TYPES.index(m.type) for m in world.markers],
-        journey=[-1] * len(world.truth),
-        tracklet=[-1] * len(world.truth),
-        frame=[-1] * len(world.truth),
-    )
-    offsets = lane_offsets(world.lanes, reference, CONFIG)
-    errors, sizes = [], []
-    for j, drift in world.drift.items():
-        mine = offsets.journey == j
-        at = (2 * offsets.frame[mine]).clamp(0, len(drift) - 1).numpy()
-        known = (offsets.weight[mine] > 20).numpy()
-        true = (drift[at, :2] * world.left[at]).sum(1)
-        found = (offsets.offset_world[mine, :2].numpy() * world.left[at]).sum(1)
-        errors.append((found - true)[known])
-        sizes.append(true[known])
-    error, size = np.concatenate(errors), np.concatenate(sizes)
-    assert np.sqrt(np.mean(error**2)) < 0.35 * np.sqrt(np.mean(size**2))
 
 
 def test_config_needs_a_gate_for_every_round() -> None:
