@@ -103,9 +103,13 @@ def coplanar_normals(
     frame: Int[Tensor, " u"],
     station: Float[Tensor, " u"],
     height: float,
+    start: Float[Tensor, " 2"],
     config: CoplanarityConfig,
 ) -> NormalUpdates:
-    """The normals at frames with given stations, each from the segments before it (eq:rne)."""
+    """The normals at frames with given stations, each from the segments before it (eq:rne).
+
+    The search begins at pitch and roll `start`: near the last normal found it ends after a step or two.
+    """
     last = (station / config.segment_m).floor().long()
     slot = torch.arange(config.segments, device=frame.device)
     segment = last[:, None] - 1 - slot
@@ -145,7 +149,7 @@ def coplanar_normals(
         S = torch.where(there[..., None, None], S, torch.diag(S.new_tensor([1.0, 2.0, 3.0])))
         return torch.where(there, singular(S), 0.0).sum(-1)
 
-    tilt, cost, H = _minimise(costs, c.new_zeros(len(frame), 2), config.iterations)
+    tilt, cost, H = _minimise(costs, start.expand(len(frame), 2), config.iterations)
     # The points of one pose are all wrong together: poses count, not points.
     freedom = (present.sum((-1, -2)) - 4 * complete[enough].sum(-1)).clamp_min(1)
     eigenvalue, V = torch.linalg.eigh(H)
@@ -183,9 +187,9 @@ def _minimise(
         return slope.detach(), 0.5 * (H + H.mT)
 
     x, value = start, costs(start)
+    g, H = slope_and_curvature(x)
     damping = torch.full_like(value, 1e-3)
     for _ in range(iterations):
-        g, H = slope_and_curvature(x)
         eigenvalue, V = torch.linalg.eigh(H)
         # Uphill curvature is walked down all the same; the damping is relative to the larger of the
         # two.
@@ -199,4 +203,5 @@ def _minimise(
         x = torch.where(better[:, None], x + step, x)
         value = torch.where(better, new, value)
         damping = torch.where(better, damping / 4, damping * 8).clamp(1e-9, 1e6)
-    return x, value, slope_and_curvature(x)[1]
+        g, H = slope_and_curvature(x)
+    return x, value, H

@@ -167,7 +167,9 @@ class RoadTracker:
         )
         update = (station / c.update_m).floor()
         frame = (update[1:] > update[:-1]).nonzero()[:, 0]
-        updates = coplanar_normals(nodes, frame, station[1:][frame], self._rig.camera_height, c)
+        updates = coplanar_normals(
+            nodes, frame, station[1:][frame], self._rig.camera_height, memory.tilt[:2], c
+        )
         tilt = _latest_admitted(updates, memory.tilt, len(level), self._config)
         kept = nodes[nodes.cell >= nodes.cell[-1:] - (c.segments + 2) * c.poses]
         travel = replace(memory.travel, station=station[-1])
