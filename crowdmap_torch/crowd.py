@@ -140,7 +140,11 @@ class Crowd:
     heads: Signs
     """The cluster heads, with the probability that they exist."""
     tentative: Signs
-    """Singles with their bias taken off, confidence below 0.5: row k is the k-th sign labelled -1."""
+    """Singles with their bias taken off, confidence below 0.5: row k is the k-th sign labelled -1.
+
+    Their covariance is absolute: triangulation, what is left of the journey's bias and drift, and what all journeys
+    share.
+    """
     bias: JourneyBias
     journey_weight: Float[Tensor, " j"]
     """1; 0 for bad drives, which had no say in the heads and biases of others."""
@@ -362,6 +366,9 @@ def _finished(
     confidence = existence(heads.n_journeys, passed, config.existence).to(heads.size)
     single = label < 0
     tentative = unbiased_signs(crowd, bias)[single]
+    drift = config.align.drift_sigma_m**2 * torch.eye(3).to(tentative.covariance)
+    of_bias = bias.covariance[tentative.journey] + bias.shared_covariance + drift
+    tentative = with_covariance(tentative, of_bias)
     low = torch.full_like(tentative.confidence, config.existence.tentative)
     return Crowd(
         label=label,

@@ -278,24 +278,17 @@ def finish_map(
     )
     provenance = {"config": config_hash(config), "journeys": [j.journey_id for j in journeys]}
     hd_map = as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
-    clusters = as_map(
-        dataset,
-        first.signs,
-        first.lanes,
-        first.tentative,
-        associations,
-        torch.zeros_like(shared),
-        provenance,
-    )
+    clusters = clusters_map(dataset, replace(first, associations=associations), provenance)
     return MapResult(hd_map, clusters, tuple(maps), first, associations, poses, state)
 
 
-def clusters_map(dataset: Dataset, first: FirstMap) -> HdMap:
+def clusters_map(dataset: Dataset, first: FirstMap, provenance: dict | None = None) -> HdMap:
     """The map of the cluster heads, before bundle adjustment."""
-    nothing = first.signs.T_world_sign.new_zeros(3, 3)
-    return as_map(
-        dataset, first.signs, first.lanes, first.tentative, first.associations, nothing, {}
-    )
+    shared = first.crowd.bias.shared_covariance
+    signs = replace(first.signs, covariance=first.signs.covariance + shared)
+    lanes, associations = first.lanes, first.associations
+    provenance = {} if provenance is None else provenance
+    return as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
 
 
 def as_map(

@@ -11,6 +11,7 @@ from crowd_world import World, make_world, pair_scores, shuffled
 from crowdmap_torch.clustering.spectral import same_partition
 from crowdmap_torch.crowd import CrowdConfig, associate_crowd, unbiased_signs
 from crowdmap_torch.crowd_signs import pairs_seen_together
+from crowdmap_torch.similarity import mahalanobis
 from crowdmap_torch.stages.existence import ExistenceConfig, existence
 from crowdmap_torch.stages.suspects import SuspectConfig, suspect_journeys
 
@@ -136,6 +137,17 @@ def test_singles_are_tentative():
     crowd = associate_crowd(world.crowd, CrowdConfig())
     assert len(crowd.tentative) == int((crowd.label < 0).sum()) > 0
     assert (crowd.tentative.confidence < 0.5).all()
+
+
+def test_tentative_signs_are_as_uncertain_as_they_say():
+    squared = []
+    for seed in range(20, 28):
+        world = make_world(seed, journeys=4, missed=0.7, ghosts=0.0, wrong_shape=0.0, fragments=0.0)
+        crowd = associate_crowd(world.crowd, CrowdConfig())
+        miss = crowd.tentative.center_world - world.center[world.sign[crowd.label < 0]]
+        squared.append(mahalanobis(miss, crowd.tentative.covariance).mean())
+    # Three degrees of freedom. The journeys' mean bias is one draw a world: 0.7 is one sigma of this mean.
+    assert float(torch.stack(squared).mean()) == pytest.approx(3.0, abs=1.5)
 
 
 def test_existence_grows_with_those_who_saw_it_and_falls_with_those_who_did_not():
