@@ -66,7 +66,7 @@ class SignAssociationConfig:
     """Tracklets predicted nearer than this, or behind the camera, are not matched."""
     max_depth_m: float = 500.0
     """Nor are those whose depth would exceed this."""
-    chunk_pairs: int = 1 << 15
+    chunk_pairs: int = 1 << 13
     """Pairs whose costs are computed at once; bounds the memory."""
 
     def __post_init__(self) -> None:

@@ -51,7 +51,7 @@ class LaneAssociationConfig:
     """Cost of another type where both are known."""
     reach_m: tuple[float, float] = (2.0, 45.0)
     """Points nearer or further ahead on the road plane are left out."""
-    chunk_pairs: int = 1 << 18
+    chunk_pairs: int = 1 << 13
     """Pairs whose costs are computed at once."""
 
     def __post_init__(self) -> None:
@@ -276,17 +276,18 @@ def _ground_costs(
     share = torch.linspace(0, 1, SAMPLES, dtype=b.extent.dtype, device=b.extent.device)
     near, far = b.extent[:, :1], b.extent[:, 1:]
     x = near + (far - near).clamp_max(25.0) * share
-    point_b = torch.stack((x, _sideways(b.curve, x), torch.zeros_like(x)), dim=-1)
-    T_a_b = se3.inverse(a.T_world_road) @ b.T_world_road
-    point_a = se3.transform(T_a_b[:, None], point_b)
+    y = _sideways(b.curve, x)
+    # The points are on the road's plane, and what matters of them in the other frame is x and y.
+    T_a_b = (se3.inverse(a.T_world_road) @ b.T_world_road)[:, :2, :, None]
+    ahead, sideways = (row[:, 0] * x + row[:, 1] * y + row[:, 3] for row in T_a_b.unbind(1))
     low, high = a.extent[:, :1], a.extent[:, 1:]
-    inside = torch.minimum(torch.maximum(point_a[..., 0], low), high)
-    beyond = (point_a[..., 0] - inside).abs()
+    inside = torch.minimum(torch.maximum(ahead, low), high)
+    beyond = (ahead - inside).abs()
     # Beyond its ends the line goes on straight.
     slope = a.curve[:, 1:2] + 2 * a.curve[:, 2:] * inside
-    expected = _sideways(a.curve, inside) + slope * (point_a[..., 0] - inside)
+    expected = _sideways(a.curve, inside) + slope * (ahead - inside)
     sigma = config.sigma_m + config.sigma_per_m * x + config.turn_sigma_per_m * beyond
-    error = ((point_a[..., 1] - expected) / sigma).square()
+    error = ((sideways - expected) / sigma).square()
     usable = beyond < config.max_beyond_m
     count = usable.sum(-1)
     cost = (error * usable).sum(-1) / count.clamp_min(1)
