@@ -357,9 +357,9 @@ def _guide(
     # Padded slots repeat the last corner, which hardly moves the median.
     error = (corners - px).median(1).values
 
-    t = journey.t_ns - journey.t_ns.amin()
+    t = journey.t_ns - journey.t_ns[:1]
     window = round(1e9 * config.guide_s)
-    span = int(t.amax()) + 2 * window + 1  # signs are further apart than any window
+    span = int(t[-1:].sum()) + 2 * window + 1  # signs are further apart than any window
     key = sign * span + t[detections.frame[rows]]
     asked = sights.sign * span + t[detections.frame[sights.row]]
     order = key.argsort(stable=True)
