@@ -32,6 +32,15 @@ def pixel_error(
     return torch.stack((u / depth, v / depth))
 
 
+def point_reprojection(
+    T_world_camera: Float[Tensor, "4 4"],
+    point_world: Float[Tensor, " 3"],
+    observation: Float[Tensor, "3 3"],
+) -> Float[Tensor, " 2"]:
+    """Pixel error of one free point in one frame."""
+    return pixel_error(se3.transform(se3.inverse(T_world_camera), point_world), observation)
+
+
 def sign_reprojection(
     T_world_camera: Float[Tensor, "4 4"],
     T_world_sign: Float[Tensor, "4 4"],
@@ -138,6 +147,22 @@ def pose_deviation(
     return se3.local(prior, T_world_camera) - drift
 
 
+def pose_prior(
+    T_world_camera: Float[Tensor, "4 4"], prior: Float[Tensor, "4 4"]
+) -> Float[Tensor, " 6"]:
+    """Deviation of a pose from its prior: along the world axes, and about the body axes (V-B, footnote)."""
+    return se3.local(prior, T_world_camera)
+
+
+def relative_pose(
+    T_world_from: Float[Tensor, "4 4"],
+    T_world_to: Float[Tensor, "4 4"],
+    measured: Float[Tensor, "4 4"],
+) -> Float[Tensor, " 6"]:
+    """Deviation of a relative pose from the `measured` pose of the second frame in the first (V-B, footnote)."""
+    return se3.local(measured, se3.inverse(T_world_from) @ T_world_to)
+
+
 def drift_transition(
     drift_from: Float[Tensor, " 6"],
     drift_to: Float[Tensor, " 6"],
@@ -163,6 +188,16 @@ def pixel_error_and_jacobian(
 
     jacobian, error = vmap(jacfwd(twice, has_aux=True))(point_camera, observation)
     return error, jacobian
+
+
+def point_reprojection_jacobian(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    point_world: Float[Tensor, "m 3"],
+    observation: Float[Tensor, "m 3 3"],
+) -> tuple[Float[Tensor, "m 2"], tuple[Tensor, Tensor]]:
+    """`point_reprojection` and its Jacobians by camera pose and point."""
+    error, by_pose, by_point = _through_pose(T_world_camera, point_world, observation)
+    return error, (by_pose, by_point)
 
 
 def sign_reprojection_jacobian(
@@ -281,12 +316,33 @@ def pose_deviation_jacobian(
     prior: Float[Tensor, "m 4 4"],
 ) -> tuple[Float[Tensor, "m 6"], tuple[Tensor, Tensor]]:
     """`pose_deviation` and its Jacobians by pose and drift; the rotation's is the inverse right Jacobian of SO(3)."""
-    error = se3.local(prior, T_world_camera)
-    by_pose = error.new_zeros(len(error), 6, 6)
-    by_pose[:, :3, :3] = torch.eye(3, dtype=error.dtype, device=error.device)
-    by_pose[:, 3:, 3:] = _right_jacobian_inverse(error[:, 3:])
+    error, (by_pose,) = pose_prior_jacobian(T_world_camera, prior)
     by_drift = -torch.eye(6, dtype=error.dtype, device=error.device).expand(len(error), 6, 6)
     return error - drift, (by_pose, by_drift)
+
+
+def pose_prior_jacobian(
+    T_world_camera: Float[Tensor, "m 4 4"], prior: Float[Tensor, "m 4 4"]
+) -> tuple[Float[Tensor, "m 6"], tuple[Tensor]]:
+    """`pose_prior` and its Jacobian by the pose."""
+    error = se3.local(prior, T_world_camera)
+    eye = torch.eye(3, dtype=error.dtype, device=error.device).expand(len(error), 3, 3)
+    return error, (_block_diagonal(eye, _right_jacobian_inverse(error[:, 3:])),)
+
+
+def relative_pose_jacobian(
+    T_world_from: Float[Tensor, "m 4 4"],
+    T_world_to: Float[Tensor, "m 4 4"],
+    measured: Float[Tensor, "m 4 4"],
+) -> tuple[Float[Tensor, "m 6"], tuple[Tensor, Tensor]]:
+    """`relative_pose` and its Jacobians by the two poses."""
+    T_from_to = se3.inverse(T_world_from) @ T_world_to
+    error = se3.local(measured, T_from_to)
+    R_t = T_world_from[:, :3, :3].mT
+    turn = _right_jacobian_inverse(error[:, 3:])
+    by_from = _block_diagonal(-R_t, -turn @ T_from_to[:, :3, :3].mT)
+    by_from[:, :3, 3:] = se3.skew(T_from_to[:, :3, 3])
+    return error, (by_from, _block_diagonal(R_t, turn))
 
 
 def drift_transition_jacobian(
@@ -324,6 +380,12 @@ def _into_camera(
         return torch.linalg.cross(by_camera, point_camera[:, None].expand_as(by_camera))
 
     return point_camera, by_rotation_of
+
+
+def _block_diagonal(a: Float[Tensor, "m 3 3"], b: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 6 6"]:
+    joint = a.new_zeros(len(a), 6, 6)
+    joint[:, :3, :3], joint[:, 3:, 3:] = a, b
+    return joint
 
 
 def _right_jacobian_inverse(w: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3 3"]:

@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.chain_structure import ChainStructure, Group, analyse
-from crowdmap_torch.optim.linear import DIAGONAL_FLOOR, Step, outer, unpack
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, chunks, linearize, rows
-from crowdmap_torch.optim.problem import Problem, Values
+from crowdmap_torch.optim.chain_structure import Batch, ChainStructure, Coupling, Level, analyse
+from crowdmap_torch.optim.linear import DIAGONAL_FLOOR, Step, unpack
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, chunks, row_blocks, rows
+from crowdmap_torch.optim.problem import CostTerm, Problem, Values
 
 
 @dataclass
@@ -35,16 +35,20 @@ class ChainBackend:
     """Variable whose blocks are bound to one block of the chain each, and go first; None: there is none."""
     carrier: Int[Tensor, " m"] | None = None
     """Block of the chain that carries each leaf."""
-    tile_size: int = 8
-    """Interior blocks of a tile."""
-    group_tiles: int = 128
-    """Tiles that share one window of columns."""
+    group_size: int | None = None
+    """Blocks that share one window of columns; None: half as many as there are chains, from 4 to 64."""
+    batch_bytes: int = 1 << 22
+    """Size of what is computed at once: about what the processor's cache holds."""
     chunk_rows: int = CHUNK_ROWS
     _problem: Problem | None = field(default=None, repr=False)
     _structure: ChainStructure | None = field(default=None, repr=False)
+    _store: Tensor | None = field(default=None, repr=False)
 
     def assemble(self, problem: Problem, values: Values) -> ChainNormalEquations:
-        """Normal equations at `values`; memory beyond them is bounded by the chunk."""
+        """Normal equations at `values`; memory beyond them is bounded by the chunk.
+
+        The workspace of the solve is the backend's: of its normal equations only the last may be solved.
+        """
         if self._structure is None or not _same_rows(problem, self._problem):
             if problem.group_count != 1:
                 raise ValueError("chains are eliminated in one problem at a time, not in a batch")
@@ -55,11 +59,15 @@ class ChainBackend:
                 self.chain,
                 leaves=self.leaves,
                 carrier=self.carrier,
-                tile_size=self.tile_size,
-                group_tiles=self.group_tiles,
+                group_size=self.group_size,
+                batch_bytes=self.batch_bytes,
             )
             self._problem = problem
-        return _assemble(problem, values, self._structure, self.chunk_rows)
+            block = values[self.eliminate]
+            k = problem.variables[self.eliminate].tangent_dim
+            self._store = block.new_empty(self._structure.store_rows + 1, k)
+        assert self._store is not None
+        return _assemble(problem, values, self._structure, self._store, self.chunk_rows)
 
 
 def _same_rows(problem: Problem, other: Problem | None) -> bool:
@@ -76,13 +84,13 @@ def _same_rows(problem: Problem, other: Problem | None) -> bool:
 
 
 @dataclass(frozen=True)
-class _Eliminated:
-    """What back-substitution needs of one group: its factor and the eliminated rows."""
+class _Reduced:
+    """The reduced system, and what back-substitution needs beside the boundary store."""
 
-    inverse_factor: Float[Tensor, "t d d"]
-    boundary: Float[Tensor, "t d b"]
-    """`L^-1 [left, right, window]`."""
-    gradient: Float[Tensor, "t d"]
+    matrix: Float[Tensor, "r r"]
+    right_side: Float[Tensor, " r"]
+    towards: list[Float[Tensor, "e k sk"]]
+    """By level: every block's inverse diagonal times its links to its neighbours."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +104,11 @@ class ChainNormalEquations:
     link: Float[Tensor, "n k k"]
     """Block of each node with its successor, of each leaf with the block that carries it."""
     chain_gradient: Float[Tensor, "n k"]
-    coupling: Mapping[str, Float[Tensor, "f k l"]]
+    coupling: Mapping[str, Float[Tensor, "f l k"]]
     hessian: Float[Tensor, "r r"]
     gradient: Float[Tensor, " r"]
+    store: Float[Tensor, "rows k"] = field(repr=False)
+    """Workspace: per block and column of its window a row of `k`, overwritten by every solve."""
 
     def solve(self, damping: Float[Tensor, " 1"]) -> Step:
         """The damped step: eliminate level by level, solve what is left, substitute back."""
@@ -108,12 +118,11 @@ class ChainNormalEquations:
         reduced = self._reduce(added_chain, added)
         if reduced is None:
             return self._failed()
-        matrix, right_side, levels = reduced
-        factor, failed = torch.linalg.cholesky_ex(matrix)
+        factor, failed = torch.linalg.cholesky_ex(reduced.matrix)
         if bool(failed):
             return self._failed()
-        packed = -torch.cholesky_solve(right_side[:, None], factor)[:, 0]
-        chain_step = self._substitute(packed, levels)
+        packed = -torch.cholesky_solve(reduced.right_side[:, None], factor)[:, 0]
+        chain_step = self._substitute(packed, reduced.towards)
         along = (self.chain_gradient * chain_step).sum() + self.gradient @ packed
         damped = (added_chain * chain_step.square()).sum() + added @ packed.square()
         delta = unpack(packed[None], self.structure.where)
@@ -129,7 +138,7 @@ class ChainNormalEquations:
         reduced = self._reduce(nothing, torch.full_like(self.gradient, floor))
         if reduced is None:
             raise ValueError("the chain's blocks are not positive definite without damping")
-        return torch.cholesky_inverse(torch.linalg.cholesky(reduced[0]))
+        return torch.cholesky_inverse(torch.linalg.cholesky(reduced.matrix))
 
     def _unstack(self, stacked: Tensor) -> dict[str, Tensor]:
         """Rows of the leaves and of the chain, by variable."""
@@ -143,215 +152,199 @@ class ChainNormalEquations:
         zero = torch.zeros_like(self.cost)
         return Step(delta, zero, torch.zeros_like(zero, dtype=torch.bool), zero)
 
-    def _reduce(
-        self, added_chain: Tensor, added: Tensor
-    ) -> tuple[Tensor, Tensor, list[list[_Eliminated]]] | None:
-        """The Schur complement on the landmarks, its right-hand side, and the eliminated rows."""
-        matrix = self.hessian + torch.diag(added)
-        right_side = self.gradient.clone()
-        diagonal = self.diagonal + torch.diag_embed(added_chain)
-        link, gradient = self.link, self.chain_gradient
-        fills: list[list[tuple[Tensor, Tensor]]] = []
-        levels: list[list[_Eliminated]] = []
-        for level in self.structure.levels:
-            next_diagonal = diagonal[level.kept]
-            next_link = link[level.kept] if level.keeps_links else torch.zeros_like(next_diagonal)
-            next_gradient = gradient[level.kept]
-            done, next_fills = [], []
-            for group in level.groups:
-                part = self._eliminate(group, diagonal, link, gradient, level.kept, fills)
-                if part is None:
-                    return None
-                k = diagonal.shape[-1]
-                both, window = part.boundary[..., : 2 * k], part.boundary[..., 2 * k :]
-                rows = window.flatten(0, 1)
-                matrix[group.columns[:, None], group.columns] -= rows.mT @ rows
-                right_side[group.columns] -= rows.mT @ part.gradient.flatten()
-                square = both.mT @ both
-                shift = (both.mT @ part.gradient[..., None])[..., 0]
-                cross = both.mT @ window
-                for side, at in ((group.left, slice(0, k)), (group.right, slice(k, 2 * k))):
-                    has = side >= 0
-                    next_diagonal.index_add_(0, side[has], -square[has, at, at])
-                    next_gradient.index_add_(0, side[has], -shift[has, at])
-                has = (group.left >= 0) & (group.right >= 0)
-                next_link[group.left[has]] = -square[has, :k, k:]
-                next_fills.append((-cross[:, :k], -cross[:, k:]))
-                done.append(part)
-            levels.append(done)
-            fills.append(next_fills)
-            diagonal, link, gradient = next_diagonal, next_link, next_gradient
-        return matrix, right_side, levels
-
-    def _eliminate(
-        self,
-        group: Group,
-        diagonal: Tensor,
-        link: Tensor,
-        gradient: Tensor,
-        kept: Tensor,
-        fills: list[list[tuple[Tensor, Tensor]]],
-    ) -> _Eliminated | None:
-        tiles, slots = group.node.shape
-        k, width = diagonal.shape[-1], len(group.columns)
-        present = group.node >= 0
-        node = group.node.clamp_min(0)
-        eye = torch.eye(k, dtype=diagonal.dtype, device=diagonal.device)
-        blocks = diagonal.new_zeros(tiles, slots, k, slots, k)
-        steps = torch.arange(slots, device=node.device)
-        blocks[:, steps, :, steps] = torch.where(
-            present[..., None, None], diagonal[node], eye
-        ).transpose(0, 1)
-        if slots > 1:
-            both = (present[:, :-1] & present[:, 1:])[..., None, None]
-            inner = torch.where(both, link[node[:, :-1]], 0.0).transpose(0, 1)
-            blocks[:, steps[:-1], :, steps[1:]] = inner
-            blocks[:, steps[1:], :, steps[:-1]] = inner.mT
-        boundary = diagonal.new_zeros(tiles, slots, k, 2 * k + width)
-        has = torch.nonzero(group.left >= 0)[:, 0]
-        boundary[has, 0, :, :k] = link[kept[group.left[has]]].mT
-        has = torch.nonzero(group.right >= 0)[:, 0]
-        boundary[has, slots - 1, :, k : 2 * k] = link[node[has, slots - 1]]
-        _scatter(boundary, group, self.coupling, fills)
-        factor, failed = torch.linalg.cholesky_ex(blocks.reshape(tiles, slots * k, slots * k))
-        if bool((failed != 0).any()):
-            return None
-        unit = torch.eye(slots * k, dtype=factor.dtype, device=factor.device).expand_as(factor)
-        inverse = torch.linalg.solve_triangular(factor, unit, upper=False)
-        right_side = torch.where(present[..., None], gradient[node], 0.0).reshape(tiles, -1, 1)
-        return _Eliminated(
-            inverse,
-            inverse @ boundary.reshape(tiles, slots * k, -1),
-            (inverse @ right_side)[..., 0],
-        )
-
-    def _substitute(self, packed: Tensor, levels: list[list[_Eliminated]]) -> Tensor:
-        """Steps of the eliminated blocks, from the last level to the first."""
+    def _reduce(self, added_chain: Tensor, added: Tensor) -> _Reduced | None:
+        """The Schur complement on the landmarks and its right-hand side; the eliminated rows are in the store."""
+        structure, store = self.structure, self.store
+        store.zero_()
+        for name, block in self.coupling.items():
+            store.index_add_(0, structure.factor_rows[name], block.flatten(0, 1))
+        store[structure.gradient_row] = self.chain_gradient
+        dim = len(self.gradient)
+        # One row and column more for the gradient, one for padding.
+        system = torch.nn.functional.pad(self.hessian + torch.diag(added), (0, 2, 0, 2))
+        system[dim, :dim] = self.gradient
+        # In the order of elimination; a block that stands for none has no links, and a diagonal that does no harm.
         k = self.diagonal.shape[-1]
-        below = packed.new_zeros(0, k)
-        for level, parts in zip(reversed(self.structure.levels), reversed(levels), strict=True):
-            here = packed.new_zeros(len(level.block_of_node), k)
-            here[level.kept] = below
-            padded = torch.cat((below, below.new_zeros(1, k)))
-            for group, part in zip(level.groups, parts, strict=True):
-                tiles, slots = group.node.shape
-                window = packed[group.columns].expand(tiles, -1)
-                known = torch.cat((padded[group.left], padded[group.right], window), dim=-1)
-                rest = part.gradient + (part.boundary @ known[..., None])[..., 0]
-                solved = -(part.inverse_factor.mT @ rest[..., None])[..., 0]
-                present = group.node >= 0
-                here[group.node[present]] = solved.reshape(tiles, slots, k)[present]
-            below = here
-        return below
+        none = torch.eye(k, dtype=store.dtype, device=store.device)[None]
+        diagonal = torch.cat((self.diagonal + torch.diag_embed(added_chain), none))
+        diagonal = diagonal[structure.order]
+        link = torch.cat((self.link, torch.zeros_like(none)))[structure.order]
+        towards = []
+        for level in structure.levels:
+            factor, failed = torch.linalg.cholesky_ex(diagonal[level.place])
+            if bool(failed.any()):
+                return None
+            inverse = torch.cholesky_inverse(factor)
+            links = link[level.place]
+            if level.neighbour.shape[1] == 2:
+                links = torch.cat((link[level.neighbour[:, 0]].mT, links), dim=-1)
+            leads = inverse @ -links
+            towards.append(leads)
+            _pass_on(level, links.mT @ leads, diagonal, link)
+            for batch in level.batches:
+                mine = slice(
+                    batch.place.start - level.place.start, batch.place.stop - level.place.start
+                )
+                _eliminate(batch, inverse[mine], leads[mine], store, system)
+        return _Reduced(system[:dim, :dim], system[dim, :dim], towards)
+
+    def _substitute(self, packed: Tensor, towards: list[Tensor]) -> Tensor:
+        """Steps of the eliminated blocks, from the last level to the first."""
+        structure, k = self.structure, self.chain_gradient.shape[1]
+        # The gradient's column counts once, padding not at all.
+        known = torch.cat((packed, packed.new_tensor([1.0, 0.0])))
+        step = packed.new_zeros(len(structure.order), k)
+        for level, leads in zip(reversed(structure.levels), reversed(towards), strict=True):
+            for batch in level.batches:
+                size = batch.fill.shape[1]
+                window = known[batch.columns].repeat_interleave(size, 0)[:, None]
+                torch.bmm(window, _rows(batch, self.store), out=step[batch.place][:, None])
+            beside = step[level.neighbour].flatten(1)[..., None]
+            step[level.place] = (leads @ beside)[..., 0] - step[level.place]
+        return step[structure.place]
 
 
-def _scatter(
-    boundary: Float[Tensor, "t s k b"],
-    group: Group,
-    coupling: Mapping[str, Tensor],
-    fills: list[list[tuple[Tensor, Tensor]]],
-) -> None:
-    """Adds a group's factors and the fill-in from below into its window, in place."""
-    _, _, k, width = boundary.shape
-    flat = boundary.view(-1)
-    entries = torch.arange(k, device=boundary.device)[:, None] * width + 2 * k
-    for part in group.factors:
-        at = part.row[:, None, None] * (k * width) + entries + part.position[:, None, :]
-        flat.index_add_(0, at.flatten(), coupling[part.coupling][part.factor].flatten())
-    for part in group.fills:
-        at = part.row[:, None, None] * (k * width) + entries + part.position
-        flat.index_add_(
-            0, at.flatten(), fills[part.level][part.group][int(part.right)][part.tile].flatten()
-        )
+def _pass_on(level: Level, square: Tensor, diagonal: Tensor, link: Tensor) -> None:
+    """What the blocks that go leave on the diagonals and links of their neighbours, in place."""
+    e, sides, k = len(level.neighbour), level.neighbour.shape[1], diagonal.shape[-1]
+    own = square.view(e, sides, k, sides, k).diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+    diagonal.view(-1, k * k).index_add_(0, level.neighbour.flatten(), own.reshape(-1, k * k))
+    if sides == 2:
+        link[level.neighbour[:, 0]] = square[:, :k, k:]
+
+
+def _rows(batch: Batch, store: Tensor) -> Tensor:
+    """The batch's rows of the boundary store, [places, w, k]."""
+    groups, size, w, _ = batch.fill.shape
+    rows = store[batch.first_row : batch.first_row + groups * size * w]
+    return rows.view(groups * size, w, store.shape[-1])
+
+
+def _eliminate(batch: Batch, inverse: Tensor, leads: Tensor, store: Tensor, system: Tensor) -> None:
+    """Eliminates a batch: into the reduced system, into its neighbours' rows, its own rows solved; in place."""
+    groups, size, w, _ = batch.fill.shape
+    k = store.shape[-1]
+    rows = _rows(batch, store)
+    solved = rows @ inverse
+    left = rows.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
+    right = solved.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
+    at = batch.columns[:, :, None] * len(system) + batch.columns[:, None]
+    system.view(-1).index_add_(0, at.flatten(), (left @ right.mT).flatten(), alpha=-1)
+    # Adding rows as they are is several times faster than subtracting them: the leads carry the sign.
+    store.index_add_(0, batch.fill.flatten(), (rows @ leads).view(-1, k))
+    rows.copy_(solved)
 
 
 def _assemble(
-    problem: Problem, values: Values, structure: ChainStructure, chunk_rows: int
+    problem: Problem, values: Values, structure: ChainStructure, store: Tensor, chunk_rows: int
 ) -> ChainNormalEquations:
-    base = structure.base
+    base, kinds = structure.base, dict(problem.variables)
     n, blocks = len(structure.chain), values[next(iter(base))]
     k = problem.variables[next(iter(base))].tangent_dim
-    dim = structure.where.dim
-    diagonal = blocks.new_zeros(n, k, k)
+    # Rows last while they are summed, as they come.
+    diagonal = blocks.new_zeros(k * k, n)
+    chain_gradient = blocks.new_zeros(k, n)
     link = blocks.new_zeros(n, k, k)
-    chain_gradient = blocks.new_zeros(n, k)
-    hessian = blocks.new_zeros(dim, dim)
-    gradient = blocks.new_zeros(dim)
+    landmarks = _LandmarkSums(structure, blocks)
     term_cost, couplings = {}, {}
-    kinds = dict(problem.variables)
 
-    for name in structure.chain_terms:
+    for name, term in problem.terms.items():
         cost = blocks.new_zeros(1)
-        for _, piece in chunks(problem.terms[name], chunk_rows):
-            linear = linearize(piece, kinds, values)
-            cost += linear.rho.sum() / 2
-            weighted = [J * linear.robust_weight[:, None, None] for J in linear.jacobians]
-            index = [block + base[slot] for slot, block in piece.slots]
-            for block, J, JW in zip(index, linear.jacobians, weighted, strict=True):
-                diagonal.index_add_(0, block, outer(JW, J))
-                chain_gradient.index_add_(0, block, (JW * linear.residual[..., None]).sum(1))
-            if len(index) == 2:
-                _add_link(
-                    link, structure, index[0], index[1], outer(weighted[0], linear.jacobians[1])
-                )
+        coupling = structure.couplings.get(name)
+        if coupling is not None and coupling.order is not None:
+            term = rows(term, coupling.order)
+        if coupling is not None:
+            couplings[name] = blocks.new_zeros(len(coupling.block), coupling.column.shape[1], k)
+        for at, piece in chunks(term, chunk_rows):
+            part = row_blocks(piece, kinds, values)
+            cost += part.rho.sum() / 2
+            chained = [i for i, (slot, _) in enumerate(piece.slots) if slot in base]
+            index = [piece.slots[i][1] + base[piece.slots[i][0]] for i in chained]
+            for i, block in zip(chained, index, strict=True):
+                diagonal.index_add_(1, block, part.hessian[i, i].flatten(0, 1))
+                chain_gradient.index_add_(1, block, part.gradient[i])
+            if len(chained) == 2:
+                _add_link(link, structure, index[0], index[1], part.hessian[0, 1].permute(2, 0, 1))
+            if coupling is not None:
+                _add_mixed(couplings[name], coupling, at, part)
+            landmarks.add(piece, part)
         term_cost[name] = cost
-
-    for name, coupling in structure.couplings.items():
-        cost = blocks.new_zeros(1)
-        width = coupling.column.shape[1]
-        mixed = blocks.new_zeros(len(coupling.block), k, width)
-        square = blocks.new_zeros(len(coupling.block), width, width)
-        for piece, term in chunks(rows(problem.terms[name], coupling.order), chunk_rows):
-            linear = linearize(term, kinds, values)
-            cost += linear.rho.sum() / 2
-            slot = coupling.eliminated_slot
-            own = linear.jacobians[slot] * linear.robust_weight[:, None, None]
-            others = [J for i, J in enumerate(linear.jacobians) if i != slot]
-            J = torch.cat(others, dim=-1)
-            block = term.slots[slot][1] + base[term.slots[slot][0]]
-            factor = coupling.factor_of_row[piece]
-            diagonal.index_add_(0, block, outer(own, linear.jacobians[slot]))
-            chain_gradient.index_add_(0, block, (own * linear.residual[..., None]).sum(1))
-            mixed.index_add_(0, factor, outer(own, J))
-            weighted = J * linear.robust_weight[:, None, None]
-            gradient.index_add_(
-                0,
-                coupling.column[factor].flatten(),
-                (weighted * linear.residual[..., None]).sum(1).flatten(),
-            )
-            square.index_add_(0, factor, outer(weighted, J))
-        at = coupling.column[:, :, None] * dim + coupling.column[:, None, :]
-        hessian.view(-1).index_add_(0, at.flatten(), square.flatten())
-        couplings[name] = mixed
-        term_cost[name] = cost
-
-    for name in structure.landmark_terms:
-        cost = blocks.new_zeros(1)
-        for _, term in chunks(problem.terms[name], chunk_rows):
-            linear = linearize(term, kinds, values)
-            cost += linear.rho.sum() / 2
-            J = torch.cat(linear.jacobians, dim=-1)
-            column = torch.cat(
-                [
-                    structure.where.offset[slot][block][:, None]
-                    + torch.arange(problem.variables[slot].tangent_dim, device=block.device)
-                    for slot, block in term.slots
-                ],
-                dim=-1,
-            )
-            weighted = J * linear.robust_weight[:, None, None]
-            gradient.index_add_(
-                0, column.flatten(), (weighted * linear.residual[..., None]).sum(1).flatten()
-            )
-            at = column[:, :, None] * dim + column[:, None, :]
-            hessian.view(-1).index_add_(0, at.flatten(), outer(weighted, J).flatten())
-        term_cost[name] = cost
-
-    total = torch.stack([term_cost[name] for name in problem.terms]).sum(0)
-    ordered = {name: term_cost[name] for name in problem.terms}
+    total = torch.stack(list(term_cost.values())).sum(0)
     return ChainNormalEquations(
-        total, ordered, structure, diagonal, link, chain_gradient, couplings, hessian, gradient
+        total,
+        term_cost,
+        structure,
+        diagonal.mT.reshape(n, k, k),
+        link,
+        chain_gradient.mT.contiguous(),
+        couplings,
+        landmarks.hessian(),
+        landmarks.gradient(),
+        store,
     )
+
+
+def _add_mixed(mixed: Tensor, coupling: Coupling, at: slice, part: RowBlocks) -> None:
+    """Adds the blocks between the eliminated slot and the others, [f, l, k], in place."""
+    slot, start = coupling.slot, 0
+    for other in range(len(part.gradient)):
+        if other == slot:
+            continue
+        cross = part.hessian[min(slot, other), max(slot, other)]
+        cross = cross.permute(2, 1, 0) if slot < other else cross.permute(2, 0, 1)
+        here = slice(start, start + cross.shape[1])
+        start = here.stop
+        if coupling.factor_of_row is None:
+            mixed[at, here] = cross
+        else:
+            mixed[:, here].index_add_(0, coupling.factor_of_row[at], cross)
+
+
+class _LandmarkSums:
+    """Gradient and Hessian of the variables that stay, summed by block before they go into one matrix."""
+
+    def __init__(self, structure: ChainStructure, like: Tensor) -> None:
+        where = structure.where
+        self.offset, self.dim, self.like = where.offset, where.dim, like
+        sizes = {name: (where.tangent_dim[name], len(at)) for name, at in self.offset.items()}
+        self.gradients = {name: like.new_zeros(k, n) for name, (k, n) in sizes.items()}
+        self.squares = {name: like.new_zeros(k * k, n) for name, (k, n) in sizes.items()}
+        self.matrix = like.new_zeros(self.dim, self.dim)
+
+    def add(self, piece: CostTerm, part: RowBlocks) -> None:
+        """Adds the rows' blocks among landmarks."""
+        stays = [i for i, (slot, _) in enumerate(piece.slots) if slot in self.offset]
+        for i in stays:
+            name, index = piece.slots[i]
+            self.gradients[name].index_add_(1, index, part.gradient[i])
+            self.squares[name].index_add_(1, index, part.hessian[i, i].flatten(0, 1))
+            for j in stays:
+                if i < j:
+                    other, index_j = piece.slots[j]
+                    at, at_j = self.offset[name][index], self.offset[other][index_j]
+                    self._scatter(at, at_j, part.hessian[i, j])
+                    self._scatter(at_j, at, part.hessian[i, j].transpose(0, 1))
+
+    def hessian(self) -> Tensor:
+        """The Hessian [dim, dim]."""
+        for name, square in self.squares.items():
+            k = len(self.gradients[name])
+            self._scatter(self.offset[name], self.offset[name], square.view(k, k, -1))
+        return self.matrix
+
+    def gradient(self) -> Tensor:
+        """The gradient [dim]."""
+        packed = self.like.new_zeros(self.dim)
+        for name, gradient in self.gradients.items():
+            at = self.offset[name] + torch.arange(len(gradient), device=packed.device)[:, None]
+            packed[at] = gradient
+        return packed
+
+    def _scatter(self, row: Tensor, column: Tensor, block: Tensor) -> None:
+        rows, columns, _ = block.shape
+        steps = torch.arange(max(rows, columns), device=row.device)[:, None]
+        at = (row + steps[:rows])[:, None] * self.dim + (column + steps[:columns])
+        self.matrix.view(-1).index_add_(0, at.flatten(), block.flatten())
 
 
 def _add_link(

@@ -1,15 +1,18 @@
-"""The order in which chains of blocks are eliminated: nested dissection, worked out once per problem.
+"""The order in which chains of blocks are eliminated: odd-even reduction, worked out once per problem.
 
-Blocks of the eliminated variable form chains (the frames of a journey). Each may carry a leaf, a block of a second
-variable that is bound to it alone (the frame's own pose, where the chain is its slow drift): leaves go first. A chain
-is cut into tiles of `tile_size` interior blocks and one separator; the interiors are eliminated, the separators are
-the chain of the next level, and so on until no block is left. Tiles that see the same landmarks (the same stretch of
-road, driven by anybody) form a group with one window of columns, so that the products of a whole group are one matrix
-product and nothing is padded to the widest of all.
+Blocks of the eliminated variable form chains (the frames of a journey). Each may carry leaves, blocks of a second
+variable that are bound to it alone (the frame's own pose, where the chain is its slow drift): leaves go first. Then
+every other block of each chain is eliminated, all chains at once; those between are the chain of the next level, half as
+long, until no block is left (cyclic or nested reduction; Golub and Van Loan, Matrix Computations, 4.5.4).
+
+What an eliminated block leaves behind lies in the columns of the landmarks that it sees, its window. Blocks that see
+the same stretch of road, driven by anybody, form a group with one window, so that their products are one matrix product.
+Groups of the same width are computed together, in batches of bounded size.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -24,71 +27,46 @@ from crowdmap_torch.optim.problem import CostTerm, Problem, Values
 
 @dataclass(frozen=True)
 class Coupling:
-    """A term between the eliminated blocks and the landmarks, its rows sorted by (block, landmarks) pair."""
+    """A term between the eliminated blocks and the landmarks, its rows sorted by (block, landmarks)."""
 
-    order: Int[Tensor, " m"]
-    """Rows of the term, in the order of their factors."""
-    factor_of_row: Int[Tensor, " m"]
-    """Rows of one eliminated block and the same landmarks add up to one factor."""
+    order: Int[Tensor, " m"] | None
+    """Rows of the term, in the order of their factors; None where they are in that order already."""
+    factor_of_row: Int[Tensor, " m"] | None
+    """Rows of one eliminated block and the same landmarks add up to one factor; None: every row is its own."""
     block: Int[Tensor, " f"]
     """Eliminated block of each factor, counted over leaves and chain."""
-    column: Int[Tensor, "f k"]
+    column: Int[Tensor, "f w"]
     """Columns of the reduced system that the factor touches."""
-    eliminated_slot: int
+    landmark: Int[Tensor, "f q"]
+    """The same as landmark blocks."""
+    slot: int
+    """Slot of the eliminated block."""
 
 
 @dataclass(frozen=True)
-class FactorPart:
-    """The factors of one coupling that belong to one group, and where they go in its window."""
+class Batch:
+    """Groups of equal width whose blocks are eliminated together; `b` groups of `g` places."""
 
-    coupling: str
-    factor: Int[Tensor, " f"]
-    row: Int[Tensor, " f"]
-    """Interior block (tile of the group times slots plus slot)."""
-    position: Int[Tensor, "f k"]
-    """Column within the group's window."""
-
-
-@dataclass(frozen=True)
-class FillPart:
-    """Fill-in from a level below: what one of its groups left on separators that are interior here."""
-
-    level: int
-    group: int
-    tile: Int[Tensor, " t"]
-    right: bool
-    """Whether the separator is the right or the left one of those tiles."""
-    row: Int[Tensor, " t"]
-    position: Int[Tensor, " w"]
-    """Where that group's columns stand in this window."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Tiles that are eliminated together."""
-
-    node: Int[Tensor, "t s"]
-    """Block of each interior slot at this level; -1 for none."""
-    left: Int[Tensor, " t"]
-    """Separator before each tile, a block of the next level; -1 for none."""
-    right: Int[Tensor, " t"]
-    columns: Int[Tensor, " w"]
-    """The window: columns of the reduced system."""
-    factors: tuple[FactorPart, ...]
-    fills: tuple[FillPart, ...]
+    place: slice
+    """Places of the order of elimination, group by group."""
+    columns: Int[Tensor, "b w"]
+    """The windows: columns of the reduced system; first its gradient, `dim`, and `dim + 1` for padding."""
+    fill: Int[Tensor, "b g w s"]
+    """Row of the boundary store that each entry's fill-in goes to, for every neighbour of the block."""
+    first_row: int
+    """Where the batch's rows begin in the boundary store."""
 
 
 @dataclass(frozen=True)
 class Level:
     """One round of elimination."""
 
-    block_of_node: Int[Tensor, " n"]
-    """Which block of the eliminated variable each node is."""
-    groups: tuple[Group, ...]
-    kept: Int[Tensor, " next"]
-    """Nodes that are the nodes of the next level, in order."""
-    keeps_links: bool
-    """Whether the kept nodes are linked to each other already: true where only leaves go."""
+    place: slice
+    """Places of the order of elimination."""
+    neighbour: Int[Tensor, "e s"]
+    """Places of the blocks that each is linked to: before and behind it in the chain, or a leaf's carrier; the
+    last place of all for none."""
+    batches: tuple[Batch, ...]
 
 
 @dataclass(frozen=True)
@@ -96,8 +74,18 @@ class ChainStructure:
     """Everything about the elimination that does not depend on values."""
 
     where: Layout
-    """The reduced system: all variables but the eliminated one."""
+    """The reduced system: all variables but the eliminated ones."""
     couplings: dict[str, Coupling]
+    factor_rows: dict[str, Int[Tensor, " fw"]]
+    """Row of the boundary store of every column of a coupling's factors."""
+    order: Int[Tensor, " places"]
+    """Block at every place of the order of elimination; the number of blocks where a group has fewer, and last."""
+    place: Int[Tensor, " n"]
+    """Place of every block."""
+    gradient_row: Int[Tensor, " n"]
+    """Row of the boundary store of every block's gradient."""
+    store_rows: int
+    """Rows of the boundary store; one more takes what is to be forgotten."""
     chain_terms: tuple[str, ...]
     """Terms among the eliminated blocks alone."""
     landmark_terms: tuple[str, ...]
@@ -118,8 +106,8 @@ def analyse(
     *,
     leaves: str | None = None,
     carrier: Int[Tensor, " m"] | None = None,
-    tile_size: int,
-    group_tiles: int,
+    group_size: int | None,
+    batch_bytes: int,
 ) -> ChainStructure:
     """The elimination of `eliminate`, whose blocks lie chain by chain, in order, and of the `leaves` on them.
 
@@ -129,6 +117,7 @@ def analyse(
     leaf_count = 0 if carrier is None else len(carrier)
     base = {eliminate: 0} if leaves is None else {leaves: 0, eliminate: leaf_count}
     where = layout(problem, values, skip=tuple(base))
+    landmarks = _landmarks(where, chain.device)
     couplings, chain_terms, landmark_terms = {}, [], []
     for name, term in problem.terms.items():
         eliminated = [i for i, (slot, _) in enumerate(term.slots) if slot in base]
@@ -137,7 +126,7 @@ def analyse(
         elif not eliminated:
             landmark_terms.append(name)
         elif len(eliminated) == 1:
-            couplings[name] = _coupling(problem, term, eliminated[0], where, base)
+            couplings[name] = _coupling(term, eliminated[0], landmarks, base)
         else:
             raise ValueError(
                 f"term {name!r} couples {len(eliminated)} eliminated blocks with other variables; "
@@ -145,261 +134,327 @@ def analyse(
             )
     carrier = chain[:0] if carrier is None else carrier
     chain = torch.cat((torch.full_like(carrier, -1), chain))
-    levels = _levels(couplings, chain, carrier, where.dim, tile_size, group_tiles)
+    k = problem.variables[eliminate].tangent_dim
+    chain_count = len(torch.unique(chain[chain >= 0]))
+    # About as many as there are drives: those that see one stretch of road at the same step.
+    size = group_size or min(64, max(4, chain_count))
+    seen = _seen(couplings, landmarks)
+    builder = _Builder(landmarks, _rank(seen, landmarks), len(chain), size, k, batch_bytes)
+    rounds = [
+        builder.windows(node, neighbour, keys)
+        for node, neighbour, keys in _rounds(seen, chain, carrier, landmarks.count)
+    ]
+    places = [table.flatten() for _, _, batches in rounds for table, _ in batches]
+    order = torch.cat((*places, chain.new_full((1,), len(chain))))
+    place = torch.full((len(chain) + 1,), len(order) - 1, device=chain.device)
+    place[order] = torch.arange(len(order), device=chain.device)
+    place[-1] = len(order) - 1
+    levels = tuple(builder.level(*windows, place) for windows in rounds)
+    factor_rows = {name: builder.rows(c.block, c.landmark) for name, c in couplings.items()}
     return ChainStructure(
-        where, couplings, tuple(chain_terms), tuple(landmark_terms), levels, base, chain, carrier
+        where,
+        couplings,
+        factor_rows,
+        order,
+        place[:-1],
+        builder.first_row[:-1],
+        builder.store_rows,
+        tuple(chain_terms),
+        tuple(landmark_terms),
+        levels,
+        base,
+        chain,
+        carrier,
     )
 
 
-def _coupling(
-    problem: Problem, term: CostTerm, slot: int, where: Layout, base: dict[str, int]
-) -> Coupling:
+@dataclass(frozen=True)
+class _Landmarks:
+    """The blocks of the variables that stay."""
+
+    first: dict[str, int]
+    """Number of each variable's first block."""
+    column: Tensor
+    """First column of every block."""
+    width: Tensor
+    dim: int
+
+    @property
+    def count(self) -> int:
+        """At least one, so that keys can be taken apart."""
+        return max(len(self.column), 1)
+
+
+def _landmarks(where: Layout, device: torch.device) -> _Landmarks:
+    first, columns, widths, total = {}, [], [], 0
+    for name, offset in where.offset.items():
+        first[name] = total
+        total += len(offset)
+        columns.append(offset)
+        widths.append(torch.full_like(offset, where.tangent_dim[name]))
+    none = torch.zeros(0, dtype=torch.long, device=device)
+    return _Landmarks(first, torch.cat([none, *columns]), torch.cat([none, *widths]), where.dim)
+
+
+def _coupling(term: CostTerm, slot: int, landmarks: _Landmarks, base: dict[str, int]) -> Coupling:
     name, block = term.slots[slot]
     block = block + base[name]
-    landmarks = [
-        (where.offset[name][index], problem.variables[name].tangent_dim)
-        for i, (name, index) in enumerate(term.slots)
-        if i != slot
+    others = [
+        index + landmarks.first[other] for i, (other, index) in enumerate(term.slots) if i != slot
     ]
-    # One number for the landmarks of a row: their first columns in mixed radix, hashed down by `unique`.
+    # One number for the landmarks of a row: mixed radix, hashed down before it can overflow.
     key = block
-    for start, _ in landmarks:
-        _, key = torch.unique(key * (where.dim + 1) + start, return_inverse=True)
-    order = torch.argsort(key, stable=True)
-    _, factor_of_row = torch.unique_consecutive(key[order], return_inverse=True)
-    count = int(factor_of_row[-1]) + 1 if len(order) else 0
-    first = torch.zeros(count, dtype=torch.long, device=block.device)
-    first[factor_of_row.flip(0)] = order.flip(0)
+    for at, index in enumerate(others):
+        if at:
+            _, key = torch.unique(key, return_inverse=True)
+        key = key * landmarks.count + index
+    order = None
+    if not bool((key[1:] >= key[:-1]).all()):
+        order = torch.argsort(key, stable=True)
+        key = key[order]
+    begins = torch.ones_like(key, dtype=torch.bool)
+    begins[1:] = key[1:] != key[:-1]
+    factor_of_row = None if bool(begins.all()) else begins.cumsum(0) - 1
+    first = torch.nonzero(begins)[:, 0]
+    first = first if order is None else order[first]
+    landmark = torch.stack([index[first] for index in others], dim=-1)
     column = torch.cat(
         [
-            start[first][:, None] + torch.arange(dim, device=block.device)
-            for start, dim in landmarks
+            landmarks.column[index[first]][:, None]
+            + torch.arange(_width(landmarks, other), device=block.device)
+            for (other, _), index in zip(
+                (s for i, s in enumerate(term.slots) if i != slot), others, strict=True
+            )
         ],
         dim=-1,
     )
-    return Coupling(order, factor_of_row, block[first], column, slot)
+    return Coupling(order, factor_of_row, block[first], column, landmark, slot)
 
 
-def _levels(
-    couplings: dict[str, Coupling],
-    chain: Int[Tensor, " n"],
-    carrier: Int[Tensor, " m"],
-    dim: int,
-    tile_size: int,
-    group_tiles: int,
-) -> tuple[Level, ...]:
-    device = chain.device
-    pairs = [
-        torch.stack((c.block[:, None].expand_as(c.column), c.column), dim=-1).reshape(-1, 2)
-        for c in couplings.values()
-    ]
-    pairs = torch.cat(pairs) if pairs else torch.zeros(0, 2, dtype=torch.long, device=device)
-    keys = torch.unique(pairs[:, 0] * max(dim, 1) + pairs[:, 1])
-    rank = _column_rank(keys, len(chain), dim, tile_size)
-
-    chain_count = len(torch.unique(chain[chain >= 0]))
-    levels: list[Level] = []
-    block_of_node = torch.arange(len(chain), device=device)
-    # Factors that are not yet placed, by coupling; each belongs to the node of its block.
-    node_of_block = torch.arange(len(chain), device=device)
-    pending = {name: torch.arange(len(c.block), device=device) for name, c in couplings.items()}
-    while len(chain):
-        leaf = chain < 0
-        cut = (
-            _leaf_tiles(carrier, len(chain)) if bool(leaf.any()) else _chain_tiles(chain, tile_size)
-        )
-        tile, slot, interior, left, right = cut.tile, cut.slot, cut.interior, cut.left, cut.right
-        kept = torch.nonzero(~interior)[:, 0]
-        tile_count = len(left)
-        slots = cut.slots
-        next_of = torch.full_like(chain, -1)
-        next_of[kept] = torch.arange(len(kept), device=device)
-        node = torch.full((tile_count, slots), -1, device=device)
-        inside = torch.nonzero(interior)[:, 0]
-        node[tile[inside], slot[inside]] = inside
-
-        key_node, key_column = keys // max(dim, 1), keys % max(dim, 1)
-        in_tile = interior[key_node]
-        tile_keys = torch.unique(tile[key_node[in_tile]] * max(dim, 1) + key_column[in_tile])
-        # Leaves of one place come by the dozen; the tiles of a chain about once a chain. More would widen the window.
-        size = group_tiles if bool(leaf.any()) else min(group_tiles, max(4, chain_count // 3))
-        groups = _groups(
-            tile_keys // max(dim, 1), tile_keys % max(dim, 1), rank, dim, tile_count, size
-        )
-        group_of_tile = torch.full((tile_count,), -1, device=device)
-        tile_in_group = torch.full((tile_count,), -1, device=device)
-        for g, (members, _) in enumerate(groups):
-            group_of_tile[members] = g
-            tile_in_group[members] = torch.arange(len(members), device=device)
-
-        placed = {name: node_of_block[couplings[name].block[f]] for name, f in pending.items()}
-        by_group = {
-            name: _split(torch.where(interior[at], group_of_tile[tile[at]], -1), len(groups))
-            for name, at in placed.items()
-        }
-        place = _Place(node_of_block, interior, group_of_tile, tile_in_group, tile, slot)
-        fills_of = _fills(levels, place, slots, len(groups))
-        built = []
-        for g, (members, columns) in enumerate(groups):
-            where_in = torch.full((max(dim, 1),), -1, device=device)
-            where_in[columns] = torch.arange(len(columns), device=device)
-            factors = []
-            for name, factor in pending.items():
-                mine = by_group[name][g]
-                if len(mine):
-                    at = placed[name][mine]
-                    row = tile_in_group[tile[at]] * slots + slot[at]
-                    columns_of = couplings[name].column[factor[mine]]
-                    factors.append(FactorPart(name, factor[mine], row, where_in[columns_of]))
-            fills = [
-                FillPart(*fill, where_in[levels[fill[0]].groups[fill[1]].columns])
-                for fill in fills_of[g]
-            ]
-            built.append(
-                Group(
-                    node[members],
-                    left[members],
-                    right[members],
-                    columns,
-                    tuple(factors),
-                    tuple(fills),
-                )
-            )
-        levels.append(Level(block_of_node, tuple(built), kept, bool(leaf.any())))
-
-        pending = {name: factor[~interior[placed[name]]] for name, factor in pending.items()}
-        tile_of_key = tile_keys // max(dim, 1)
-        column_of_key = tile_keys % max(dim, 1)
-        separators = [next_of[key_node[~in_tile]] * max(dim, 1) + key_column[~in_tile]]
-        for side in (left, right):
-            has = side[tile_of_key] >= 0
-            separators.append(side[tile_of_key[has]] * max(dim, 1) + column_of_key[has])
-        keys = torch.unique(torch.cat(separators))
-        node_of_block = torch.full_like(node_of_block, -1)
-        block_of_node = block_of_node[kept]
-        node_of_block[block_of_node] = torch.arange(len(kept), device=device)
-        chain = chain[kept]
-    return tuple(levels)
+def _width(landmarks: _Landmarks, name: str) -> int:
+    first = landmarks.first[name]
+    return int(landmarks.width[first]) if first < len(landmarks.width) else 0
 
 
-def _split(label: Int[Tensor, " n"], count: int) -> tuple[Tensor, ...]:
-    """The rows of every label from 0 to `count - 1`; rows of label -1 are left out."""
-    order = torch.argsort(label, stable=True)
-    sizes = torch.bincount(label + 1, minlength=count + 1).tolist()
-    return order.split(sizes)[1:]
+def _seen(couplings: dict[str, Coupling], landmarks: _Landmarks) -> Int[Tensor, " keys"]:
+    """Which block sees which landmark: keys `block * count + landmark`, sorted and unique."""
+    keys = [(c.block[:, None] * landmarks.count + c.landmark).flatten() for c in couplings.values()]
+    none = torch.zeros(0, dtype=torch.long, device=landmarks.column.device)
+    return torch.unique(torch.cat([none, *keys]))
 
 
-@dataclass(frozen=True)
-class _Tiles:
-    """How the nodes of a level are cut."""
-
-    tile: Tensor
-    slot: Tensor
-    interior: Tensor
-    left: Tensor
-    right: Tensor
-    slots: int
-
-
-def _chain_tiles(chain: Int[Tensor, " n"], tile_size: int) -> _Tiles:
-    """Tiles of `tile_size` interior nodes and the separator behind them."""
-    n = len(chain)
-    index = torch.arange(n, device=chain.device)
-    first = torch.ones(n, dtype=torch.bool, device=chain.device)
-    first[1:] = chain[1:] != chain[:-1]
-    position = index - index[first][first.cumsum(0) - 1]
-    slot = position % (tile_size + 1)
-    tile = (first | (slot == 0)).cumsum(0) - 1
-    interior = slot < tile_size
-    separator = torch.nonzero(~interior)[:, 0]
-    next_of = torch.arange(len(separator), device=chain.device)
-    left = torch.full((int(tile[-1]) + 1,), -1, device=chain.device)
-    right = left.clone()
-    right[tile[separator]] = next_of
-    # The separator before a tile is the last node of the tile before it, in the same chain.
-    follows = ~torch.cat((first[1:], first.new_ones(1)))[separator]
-    left[tile[separator[follows] + 1]] = next_of[follows]
-    return _Tiles(tile, slot, interior, left, right, tile_size)
-
-
-def _leaf_tiles(carrier: Int[Tensor, " m"], count: int) -> _Tiles:
-    """Tiles of one leaf each, its separator the chain's block that carries it."""
-    leaves = len(carrier)
-    tile = torch.zeros(count, dtype=torch.long, device=carrier.device)
-    tile[:leaves] = torch.arange(leaves, device=carrier.device)
-    interior = torch.arange(count, device=carrier.device) < leaves
-    return _Tiles(tile, torch.zeros_like(tile), interior, torch.full_like(carrier, -1), carrier, 1)
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where the nodes of the level that is being built lie."""
-
-    node_of_block: Tensor
-    interior: Tensor
-    group_of_tile: Tensor
-    tile_in_group: Tensor
-    tile: Tensor
-    slot: Tensor
-
-
-def _fills(
-    levels: list[Level], place: _Place, slots: int, count: int
-) -> list[list[tuple[int, int, Tensor, bool, Tensor]]]:
-    """What all levels below left on the separators that each group eliminates: level, group, tiles, side, rows.
-
-    A separator may stay one for several levels: its fill-in waits with the group that made it.
-    """
-    fills: list[list[tuple[int, int, Tensor, bool, Tensor]]] = [[] for _ in range(count)]
-    for number, level in enumerate(levels):
-        # Blocks that are eliminated by now have node -1; their fill-in has been used.
-        node = place.node_of_block[level.block_of_node[level.kept]]
-        is_here = (node >= 0) & place.interior[node]
-        tile = place.tile[node]
-        row = torch.where(is_here, place.tile_in_group[tile] * slots + place.slot[node], -1)
-        group_of = torch.where(is_here, place.group_of_tile[tile], -1)
-        for b, group in enumerate(level.groups):
-            for is_right, side in ((False, group.left), (True, group.right)):
-                index = torch.nonzero(side >= 0)[:, 0]
-                to_group = group_of[side[index]]
-                for g in torch.unique(to_group).tolist():
-                    if g >= 0:
-                        of_group = index[to_group == g]
-                        fills[g].append((number, b, of_group, is_right, row[side[of_group]]))
-    return fills
-
-
-def _groups(
-    key_tile: Tensor,
-    key_column: Tensor,
-    rank: Tensor,
-    dim: int,
-    tile_count: int,
-    group_tiles: int,
-) -> list[tuple[Tensor, Tensor]]:
-    """Tiles in the order of their windows, cut into runs; with each run the union of its windows."""
-    count = torch.bincount(key_tile, minlength=tile_count)
-    total = torch.zeros(tile_count, dtype=torch.float64, device=key_tile.device)
-    total.index_add_(0, key_tile, rank[key_column].to(total) if dim else total[:0])
-    # Frames that see lanes have windows several times as wide as those that see signs alone: keep the two apart.
-    position = total / count.clamp_min(1)
-    wide = count > count.to(total).mean()
-    order = torch.argsort(position + wide * (len(rank) + 1), stable=True)
-    group_of_tile = torch.empty_like(order)
-    group_of_tile[order] = torch.arange(tile_count, device=order.device) // group_tiles
-    members = order.split(group_tiles)
-    columns = torch.unique(group_of_tile[key_tile] * max(dim, 1) + key_column)
-    sizes = torch.bincount(columns // max(dim, 1), minlength=len(members)).tolist()
-    return list(zip(members, (columns % max(dim, 1)).split(sizes), strict=True))
-
-
-def _column_rank(keys: Tensor, n: int, dim: int, tile_size: int) -> Tensor:
-    """A position of every column on a line, such that columns seen together are near each other."""
-    if not dim:
-        return torch.zeros(0, dtype=torch.long, device=keys.device)
-    tile, column = (keys // dim // (tile_size + 1)).cpu().numpy(), (keys % dim).cpu().numpy()
-    seen = coo_matrix((torch.ones(len(tile)).numpy(), (tile, column)), shape=(n, dim)).tocsr()
+def _rank(keys: Tensor, landmarks: _Landmarks) -> Tensor:
+    """A position of every landmark on a line, such that landmarks seen together are near each other."""
+    count = landmarks.count
+    # Blocks of a chain see nearly what their neighbours see: a few of them together tell the same.
+    row, column = (keys // count // 8).cpu().numpy(), (keys % count).cpu().numpy()
+    rows = int(row.max()) + 1 if len(row) else 1
+    seen = coo_matrix((torch.ones(len(row)).numpy(), (row, column)), shape=(rows, count)).tocsr()
     order = reverse_cuthill_mckee((seen.T @ seen).tocsr(), symmetric_mode=True)
-    rank = torch.empty(dim, dtype=torch.long)
-    rank[torch.from_numpy(order.astype("int64"))] = torch.arange(dim)
+    rank = torch.empty(count, dtype=torch.double)
+    rank[torch.from_numpy(order.astype("int64"))] = torch.arange(count, dtype=torch.double)
     return rank.to(keys.device)
+
+
+def _rounds(
+    keys: Tensor, chain: Tensor, carrier: Tensor, count: int
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Per round the blocks that go, their neighbours, and what they see by then, as keys."""
+    n, leaves = len(chain), len(carrier)
+    index = torch.arange(n, device=chain.device)
+    if leaves:
+        neighbour = (carrier + leaves)[:, None]
+        yield index[:leaves], neighbour, keys[keys < leaves * count]
+        keys = _passed_on(keys, index[:leaves], neighbour, n, count)
+    node = index[leaves:]
+    while len(node):
+        of = chain[node]
+        first = torch.ones_like(of, dtype=torch.bool)
+        first[1:] = of[1:] != of[:-1]
+        at = torch.arange(len(node), device=node.device)
+        goes = (at - at[first][first.cumsum(0) - 1]) % 2 == 0
+        last = torch.cat((first[1:], first.new_ones(1)))
+        before = torch.where(first, n, torch.cat((node[:1], node[:-1])))
+        behind = torch.where(last, n, torch.cat((node[1:], node[-1:])))
+        neighbour = torch.stack((before, behind), dim=-1)[goes]
+        gone = torch.zeros(n, dtype=torch.bool, device=node.device)
+        gone[node[goes]] = True
+        yield node[goes], neighbour, keys[gone[keys // count]]
+        keys = _passed_on(keys, node[goes], neighbour, n, count)
+        node = node[~goes]
+
+
+def _passed_on(keys: Tensor, node: Tensor, neighbour: Tensor, n: int, count: int) -> Tensor:
+    """What the blocks that stay see once `node` are gone: what they saw, and what their neighbours saw."""
+    heir = torch.arange(n + 1, device=keys.device)[:, None].repeat(1, neighbour.shape[1])
+    heir[node] = neighbour
+    block, landmark = keys // count, keys % count
+    heirs = heir[block]
+    passed = (heirs * count + landmark[:, None])[heirs < n]
+    return torch.unique(passed)
+
+
+@dataclass
+class _Builder:
+    """Lays the levels out in the boundary store."""
+
+    landmarks: _Landmarks
+    rank: Tensor
+    n: int
+    group_size: int
+    k: int
+    batch_bytes: int
+
+    def __post_init__(self) -> None:
+        device = self.rank.device
+        self.store_rows = 0
+        self.places = 0
+        self.batch_rows: list[int] = []
+        self.first_row = torch.full((self.n + 1,), -1, dtype=torch.long, device=device)
+        self.group_of = torch.full((self.n + 1,), -1, dtype=torch.long, device=device)
+        self.groups = 0
+        self.window_keys: list[Tensor] = []
+        self.window_places: list[Tensor] = []
+        # The blocks of a variable lie behind each other, and so do the variables.
+        width = self.landmarks.width
+        self.landmark_of = torch.repeat_interleave(torch.arange(len(width), device=device), width)
+        self._keys = self._places = torch.zeros(0, dtype=torch.long, device=device)
+
+    def windows(
+        self, node: Tensor, neighbour: Tensor, keys: Tensor
+    ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
+        """Groups the blocks of a round, and gives every group its window and its rows in the store."""
+        count, device = self.landmarks.count, node.device
+        place = torch.full((self.n + 1,), -1, dtype=torch.long, device=device)
+        place[node] = torch.arange(len(node), device=device)
+        block, landmark = place[keys // count], keys % count
+        width = torch.zeros(len(node), dtype=torch.double, device=device)
+        width.index_add_(0, block, self.landmarks.width[landmark].double())
+        position = torch.zeros_like(width).index_add_(
+            0, block, self.rank[landmark] * self.landmarks.width[landmark]
+        ) / width.clamp_min(1)
+        # Blocks that see lanes have windows several times as wide as those that see signs alone: keep them apart.
+        wide = width > width.mean()
+        order = torch.argsort(position + wide * (len(self.rank) + 1), stable=True)
+        size = self.group_size
+        if bool(width.mean() > self.landmarks.dim / 2):
+            size = min(len(node), 4 * size)
+        group_count = -(-len(node) // size)
+        table = torch.full((group_count * size,), self.n, dtype=torch.long, device=device)
+        table[: len(node)] = node[order]
+        group = torch.empty(len(node), dtype=torch.long, device=device)
+        group[order] = torch.arange(len(node), device=device) // size
+        window = torch.unique(group[block] * count + landmark)
+        of, landmark = window // count, window % count
+        each = self.landmarks.width[landmark]
+        # The gradient is every window's first column.
+        start = each.cumsum(0) - each
+        total = torch.zeros(group_count, dtype=torch.long, device=device).index_add_(0, of, each)
+        start = start - (total.cumsum(0) - total)[of] + 1
+        self.window_keys.append((self.groups + of) * count + landmark)
+        self.window_places.append(start)
+        padded = _padded(total + 1)
+        table = table.view(group_count, size)
+        batches = []
+        for w in torch.unique(padded).tolist():
+            members = torch.nonzero(padded == w)[:, 0]
+            most = max(1, self.batch_bytes // (size * w * self.k * 8))
+            for part in members.split(most):
+                rows = self.store_rows + torch.arange(len(part) * size, device=device).mul_(w).view(
+                    -1, size
+                )
+                self.first_row[table[part]] = rows
+                self.group_of[table[part]] = self.groups + part[:, None].expand(-1, size)
+                self.batch_rows.append(self.store_rows)
+                batches.append((table[part], _expand(of, landmark, start, part, w, self)))
+                self.store_rows += len(part) * size * w
+        self.first_row[self.n] = self.group_of[self.n] = -1
+        self.groups += group_count
+        return node, neighbour, batches
+
+    def level(
+        self,
+        node: Tensor,
+        neighbour: Tensor,
+        batches: list[tuple[Tensor, Tensor]],
+        place: Tensor,
+    ) -> Level:
+        """The round with the rows that every fill-in goes to; once all rounds have their windows."""
+        towards = torch.full(
+            (self.n + 1, neighbour.shape[1]), self.n, dtype=torch.long, device=node.device
+        )
+        towards[node] = neighbour
+        first = self.places
+        built, neighbours = [], []
+        for nodes, columns in batches:
+            heir = towards[nodes]
+            fill = self._fill_rows(columns, heir)
+            here = slice(self.places, self.places + nodes.numel())
+            self.places = here.stop
+            built.append(Batch(here, columns, fill, self.batch_rows.pop(0)))
+            neighbours.append(place[heir].flatten(0, 1))
+        return Level(slice(first, self.places), torch.cat(neighbours), tuple(built))
+
+    def _fill_rows(self, columns: Tensor, heir: Tensor) -> Tensor:
+        """Store rows [b, g, w, s] of the windows' columns at the heirs [b, g, s]."""
+        dim = self.landmarks.dim
+        known = columns < dim
+        lm = rest = torch.zeros_like(columns)[:, None, :, None]
+        if dim:
+            at = torch.where(known, columns, 0)
+            lm = self.landmark_of[at]
+            lm, rest = lm[:, None, :, None], (at - self.landmarks.column[lm])[:, None, :, None]
+        place, found = self._place(self.group_of[heir][:, :, None, :], lm)
+        is_gradient = (columns == dim)[:, None, :, None]
+        row = self.first_row[heir][:, :, None, :] + torch.where(is_gradient, 0, place + rest)
+        has = (heir < self.n)[:, :, None, :]
+        good = has & (is_gradient | (found & known[:, None, :, None]))
+        return torch.where(good, row, self.store_rows)
+
+    def rows(self, block: Tensor, landmark: Tensor) -> Tensor:
+        """Store rows of factors' columns, one behind the other."""
+        parts = []
+        for at in range(landmark.shape[1]):
+            lm = landmark[:, at]
+            place, _ = self._place(self.group_of[block], lm)
+            width = int(self.landmarks.width[lm[0]]) if len(lm) else 0
+            start = self.first_row[block] + place
+            parts.append(start[:, None] + torch.arange(width, device=block.device))
+        return torch.cat(parts, dim=-1).flatten()
+
+    def _place(self, group: Tensor, landmark: Tensor) -> tuple[Tensor, Tensor]:
+        """Where a landmark stands in a group's window, and whether it does."""
+        if self.window_keys:
+            self._keys, self._places = torch.cat(self.window_keys), torch.cat(self.window_places)
+            self.window_keys, self.window_places = [], []
+        group, landmark = torch.broadcast_tensors(group, landmark)
+        key = group * self.landmarks.count + landmark
+        if not len(self._keys):
+            return torch.zeros_like(key), torch.zeros_like(key, dtype=torch.bool)
+        at = torch.searchsorted(self._keys, key).clamp_max(len(self._keys) - 1)
+        return self._places[at], self._keys[at] == key
+
+
+def _expand(
+    of: Tensor, landmark: Tensor, start: Tensor, part: Tensor, w: int, builder: _Builder
+) -> Tensor:
+    """Columns [b, w] of the windows of the groups `part`."""
+    marks = builder.landmarks
+    columns = torch.full((len(part), w), marks.dim + 1, dtype=torch.long, device=of.device)
+    columns[:, 0] = marks.dim
+    row = torch.full((int(of.max()) + 1 if len(of) else 1,), -1, device=of.device)
+    row = torch.cat((row, row.new_full((int(part.max()) + 1,), -1)))
+    row[part] = torch.arange(len(part), device=of.device)
+    mine = torch.nonzero(row[of] >= 0)[:, 0]
+    each = marks.width[landmark[mine]]
+    entry = torch.repeat_interleave(torch.arange(len(mine), device=of.device), each)
+    rest = torch.arange(len(entry), device=of.device) - (each.cumsum(0) - each)[entry]
+    at = mine[entry]
+    columns[row[of[at]], start[at] + rest] = marks.column[landmark[at]] + rest
+    return columns
+
+
+def _padded(width: Tensor) -> Tensor:
+    """Widths rounded up by at most an eighth, so that there are few different ones."""
+    step = (2.0 ** (width.double().log2().floor() - 3)).clamp_min(4).long()
+    return -(-width // step) * step

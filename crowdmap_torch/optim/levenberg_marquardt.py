@@ -19,6 +19,8 @@ from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
+_LEAST_STRETCH = 1.15
+"""Steps that should be longer by less than this stay as they are."""
 REASONS = (
     "still running",
     "converged: the cost no longer falls",
@@ -45,6 +47,9 @@ class LmConfig:
     """A problem whose damping passes this has stalled."""
     min_damping: float = 1e-12
     """The damping never falls below this."""
+    max_stretch: float = 1.0
+    """Longest that an accepted step may be made, as a multiple, where the model proved too cautious: the weights of
+    robust losses overrate the curvature. 1: never; longer ones cost one more evaluation of the cost."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +119,13 @@ def step(
     decrease = normal.cost - cost
     gain = decrease / proposal.predicted.clamp_min(torch.finfo(cost.dtype).tiny)
     accepted = running & proposal.solved & cost.isfinite() & (decrease > 0)
+    # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
+    stretch = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(accepted, 1.0)
+    if bool((stretch > _LEAST_STRETCH).any()):
+        candidate, term_cost, cost = _stretched(
+            problem, state.values, proposal.delta, stretch, (candidate, term_cost, cost)
+        )
+        decrease = normal.cost - cost
 
     shrink = (1 - (2 * gain - 1) ** 3).clamp(1 / 3, 2.0)
     damping = torch.where(accepted, state.damping * shrink, state.damping * state.growth)
@@ -147,6 +159,32 @@ def step(
         # After a rejected step the linearisation still holds.
         normal=None if moved else normal,
         iterations=state.iterations + 1,
+    )
+
+
+def _stretched(
+    problem: Problem,
+    values: Values,
+    delta: Mapping[str, Tensor],
+    stretch: Float[Tensor, " groups"],
+    plain: tuple[Values, dict[str, Tensor], Tensor],
+) -> tuple[Values, dict[str, Tensor], Tensor]:
+    """Values, costs by term and cost after a longer step, where that is better than the `plain` one."""
+    longer = {}
+    for name, tangent in delta.items():
+        group = problem.variables[name].group
+        longer[name] = tangent * (stretch[0] if group is None else stretch[group][:, None])
+    candidate = retract(problem, values, longer)
+    term_cost = term_costs(problem, candidate)
+    cost = torch.stack(list(term_cost.values())).sum(0)
+    old, old_term_cost, old_cost = plain
+    better = cost < old_cost
+    if not bool(better.any()):
+        return plain
+    return (
+        _merge(problem, old, candidate, better),
+        {name: torch.where(better, new, old_term_cost[name]) for name, new in term_cost.items()},
+        torch.where(better, cost, old_cost),
     )
 
 

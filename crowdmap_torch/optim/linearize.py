@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,7 +12,7 @@ from torch.func import jacfwd, vmap
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
 
-CHUNK_ROWS = 1 << 16
+CHUNK_ROWS = 1 << 14
 """Rows that are linearised at once; bounds the memory, whatever the size of the problem."""
 
 
@@ -48,7 +48,8 @@ def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:
     if not len(term):
         return torch.zeros(0, 1, dtype=next(iter(values.values())).dtype)
     blocks = [values[name][block] for name, block in term.slots]
-    return _whiten(term, vmap(term.residual)(*blocks, *term.constants))
+    batched = term.batched or vmap(term.residual)
+    return _whiten(term, batched(*blocks, *term.constants))
 
 
 def linearize(term: CostTerm, variables: dict[str, Variable], values: Values) -> LinearRows:
@@ -64,6 +65,62 @@ def linearize(term: CostTerm, variables: dict[str, Variable], values: Values) ->
         jacobians = tuple(J * scale[..., None] for J in jacobians)
     s = residual.square().sum(-1)
     return LinearRows(residual, jacobians, term.loss.weight(s), term.loss.rho(s))
+
+
+@dataclass(frozen=True)
+class RowBlocks:
+    """Every row's part of the normal equations, by slot, with the rows as the last axis.
+
+    Rows last: the blocks are small and the rows many, so that every operation runs along the rows.
+    """
+
+    rho: Float[Tensor, " m"]
+    gradient: tuple[Float[Tensor, "k m"], ...]
+    """`J_i^T W r` of every slot i."""
+    hessian: Mapping[tuple[int, int], Float[Tensor, "k l m"]]
+    """`J_i^T W J_j` of every two slots i <= j."""
+
+
+def row_blocks(term: CostTerm, variables: dict[str, Variable], values: Values) -> RowBlocks:
+    """Every row's gradient and Hessian blocks, by the term's own function or from its Jacobians."""
+    if term.normal is not None:
+        blocks = tuple(values[name][block] for name, block in term.slots)
+        return term.normal(blocks, term.constants, term.weight, term.loss)
+    linear = linearize(term, variables, values)
+    return blocks_of_jacobians(
+        linear.residual.mT,
+        tuple(J.permute(1, 2, 0) for J in linear.jacobians),
+        linear.robust_weight,
+        linear.rho,
+    )
+
+
+def blocks_of_jacobians(
+    residual: Float[Tensor, "d m"],
+    jacobians: tuple[Float[Tensor, "d k m"], ...],
+    robust_weight: Float[Tensor, " m"],
+    rho: Float[Tensor, " m"],
+) -> RowBlocks:
+    """Blocks of whitened residuals and Jacobians, rows last."""
+    jacobians = tuple(J.contiguous() for J in jacobians)
+    weighted = tuple(J * robust_weight for J in jacobians)
+    return RowBlocks(
+        rho,
+        tuple(sum_of_products(J, residual[:, None]).squeeze(1) for J in weighted),
+        {
+            (i, j): sum_of_products(weighted[i], jacobians[j])
+            for i in range(len(jacobians))
+            for j in range(i, len(jacobians))
+        },
+    )
+
+
+def sum_of_products(a: Float[Tensor, "d k m"], b: Float[Tensor, "d l m"]) -> Float[Tensor, "k l m"]:
+    """`a^T b` of every row, rows last."""
+    total = a[0, :, None] * b[0]
+    for i in range(1, len(a)):
+        total.addcmul_(a[i, :, None], b[i])
+    return total
 
 
 def autograd_jacobians(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -46,6 +47,10 @@ class CostTerm:
     loss: Loss = field(default_factory=Quadratic)
     jacobian: Callable[..., tuple[Tensor, tuple[Tensor, ...]]] | None = None
     """Batched residuals [m, d] and one Jacobian [m, d, k] per slot, by the chain rule; None: by autograd."""
+    batched: Callable[..., Tensor] | None = None
+    """`residual` of many rows at once [m, d], where that is faster than mapping it over the rows."""
+    normal: Callable[..., Any] | None = None
+    """`linearize.RowBlocks` of many rows: `(blocks, constants, weight, loss)`; None: from the Jacobians."""
 
     def __len__(self) -> int:
         return len(self.slots[0][1])

@@ -93,10 +93,10 @@ def problem(chain_lengths, landmarks=9, seed=0):
 
 
 @pytest.mark.parametrize("lengths", [[1], [9], [10, 1, 9, 8], [85, 40], [19, 2, 33]])
-@pytest.mark.parametrize(("tile_size", "group_tiles"), [(8, 32), (1, 1), (3, 2)])
-def test_elimination_gives_the_dense_step(lengths, tile_size, group_tiles):
+@pytest.mark.parametrize(("group_size", "batch_bytes"), [(None, 1 << 22), (1, 1), (3, 2000)])
+def test_elimination_gives_the_dense_step(lengths, group_size, batch_bytes):
     built, values, chain = problem(lengths)
-    backend = ChainBackend("pose", chain, tile_size=tile_size, group_tiles=group_tiles)
+    backend = ChainBackend("pose", chain, group_size=group_size, batch_bytes=batch_bytes)
     chained, dense = (b.assemble(built, values) for b in (backend, DenseBackend()))
     torch.testing.assert_close(chained.cost, dense.cost)
     for damping in (1e-6, 1e-1, 1e3):
@@ -125,7 +125,7 @@ def test_leaves_and_chain_give_the_dense_step(lengths):
     variables = {**built.variables, "drift": Variable(3, euclidean)}
     problem_with_leaves = Problem(variables, {**terms, "bound": bound})
     values = {**values, "drift": values["pose"] + 0.1}
-    backend = ChainBackend("drift", chain, leaves="pose", carrier=every, tile_size=4, group_tiles=7)
+    backend = ChainBackend("drift", chain, leaves="pose", carrier=every, group_size=7)
     damping = torch.tensor([1e-3], dtype=torch.float64)
     ours = backend.assemble(problem_with_leaves, values).solve(damping)
     dense = DenseBackend().assemble(problem_with_leaves, values)
@@ -158,7 +158,7 @@ def test_a_block_of_the_chain_may_carry_several_leaves():
     }
     carried = Problem({**built.variables, "drift": Variable(3, euclidean)}, terms)
     values = {**values, "drift": values["pose"][begins] + 0.1}
-    backend = ChainBackend("drift", drift_chain, leaves="pose", carrier=carrier, tile_size=3)
+    backend = ChainBackend("drift", drift_chain, leaves="pose", carrier=carrier, group_size=3)
     damping = torch.tensor([1e-3], dtype=torch.float64)
     ours = backend.assemble(carried, values).solve(damping)
     theirs = DenseBackend().assemble(carried, values).solve(damping)

@@ -1,0 +1,203 @@
+"""The residuals of bundle adjustment for many rows at once: values, and blocks of the normal equations.
+
+The same residuals as in `residuals`, and the same derivatives; tests hold one against the other. Here the rows are the
+last axis and every number of a row a plane of its own, so that all arithmetic runs along the rows; and what two blocks
+share is computed once: a pixel depends on pose and point through the point's place in the camera alone.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.optim.linearize import RowBlocks, sum_of_products
+from crowdmap_torch.optim.robust import Loss
+from crowdmap_torch.residuals import MIN_DEPTH
+
+
+def point_reprojection(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    point_world: Float[Tensor, "m 3"],
+    observation: Float[Tensor, "m 3 3"],
+) -> Float[Tensor, "m 2"]:
+    """`residuals.point_reprojection` of many rows."""
+    R, p = _planes(T_world_camera)
+    offset = point_world.mT - p
+    error, _ = _project(_turn(R, offset), observation.permute(1, 2, 0))
+    return error.mT
+
+
+def point_reprojection_blocks(
+    blocks: tuple[Float[Tensor, "m 4 4"], Float[Tensor, "m 3"]],
+    constants: tuple[Float[Tensor, "m 3 3"]],
+    weight: Float[Tensor, " m"],
+    loss: Loss,
+) -> RowBlocks:
+    """`residuals.point_reprojection` by camera pose and point."""
+    R, p = _planes(blocks[0])
+    point = _turn(R, blocks[1].mT - p)
+    M = constants[0].permute(1, 2, 0).contiguous()
+    error, depth = _project(point, M)
+    error = error * weight
+    by_camera = _by_camera(error, weight, depth, M)
+    pose, gradient, rho = _pose_blocks(R, point, error, by_camera, loss)
+    return RowBlocks(
+        rho,
+        (gradient, -gradient[:3]),
+        # Moving the camera one way is moving the point the other.
+        {(0, 0): pose, (0, 1): -pose[:, :3], (1, 1): pose[:3, :3]},
+    )
+
+
+def _turn(R_a_b: Float[Tensor, "3 3 m"], v_a: Float[Tensor, "3 m"]) -> Float[Tensor, "3 m"]:
+    """Vectors of frame a in frame b: `R_a_b^T v_a`."""
+    return (R_a_b[0] * v_a[0]).addcmul_(R_a_b[1], v_a[1]).addcmul_(R_a_b[2], v_a[2])
+
+
+def _project(
+    point: Float[Tensor, "3 m"], M: Float[Tensor, "3 3 m"]
+) -> tuple[Float[Tensor, "2 m"], Float[Tensor, " m"]]:
+    """Pixel errors of camera-frame points, and their depths in the observation's frame."""
+    u = (M[:, 0] * point[0]).addcmul_(M[:, 1], point[1]).addcmul_(M[:, 2], point[2])
+    depth = u[2].clamp_min(MIN_DEPTH)
+    return u[:2] / depth, depth
+
+
+def _by_camera(
+    error: Float[Tensor, "2 m"],
+    weight: Float[Tensor, " m"],
+    depth: Float[Tensor, " m"],
+    M: Float[Tensor, "3 3 m"],
+) -> Float[Tensor, "2 3 m"]:
+    """Derivative of the whitened pixel error by the camera-frame point."""
+    # Where the depth is held it has no part in the derivative.
+    slope = torch.where(depth > MIN_DEPTH, error, 0.0)
+    return (M[:2] * weight - slope[:, None] * M[2]) / depth
+
+
+def _pose_blocks(
+    R: Float[Tensor, "3 3 m"],
+    point: Float[Tensor, "3 m"],
+    error: Float[Tensor, "d m"],
+    by_camera: Float[Tensor, "d 3 m"],
+    loss: Loss,
+) -> tuple[Float[Tensor, "6 6 m"], Float[Tensor, "6 m"], Float[Tensor, " m"]]:
+    """Hessian and gradient by camera pose of residuals of a camera-frame point, and their losses."""
+    s = error.square().sum(0)
+    robust = loss.weight(s)
+    x, y, z = by_camera.unbind(1)
+    moved = x[:, None] * R[:, 0]
+    moved.addcmul_(y[:, None], R[:, 1]).addcmul_(z[:, None], R[:, 2]).neg_()
+    turned = (
+        y * point[2] - z * point[1],
+        z * point[0] - x * point[2],
+        x * point[1] - y * point[0],
+    )
+    J = torch.cat((moved, torch.stack(turned, dim=1)), dim=1)
+    JW = J * robust
+    hessian = JW[0, :, None] * J[0]
+    gradient = JW[0] * error[0]
+    for i in range(1, len(J)):
+        hessian.addcmul_(JW[i, :, None], J[i])
+        gradient.addcmul_(JW[i], error[i])
+    return hessian, gradient, loss.rho(s)
+
+
+def pose_prior_blocks(
+    blocks: tuple[Float[Tensor, "m 4 4"]],
+    constants: tuple[Float[Tensor, "m 4 4"]],
+    weight: Float[Tensor, "m 6"],
+    loss: Loss,
+) -> RowBlocks:
+    """`residuals.pose_prior` by the pose."""
+    R, p = _planes(blocks[0])
+    R_prior, p_prior = _planes(constants[0])
+    turned = _log(sum_of_products(R_prior, R))
+    error, w = torch.cat((p - p_prior, turned)), weight.mT
+    s = (error * w).square().sum(0)
+    square = w.square() * loss.weight(s)
+    B = _right_jacobian_inverse(turned)
+    hessian = error.new_zeros(6, 6, error.shape[1])
+    hessian[(0, 1, 2), (0, 1, 2)] = square[:3]
+    hessian[3:, 3:] = sum_of_products(B * square[3:, None], B)
+    pulled = square * error
+    gradient = torch.cat((pulled[:3], _turn(B, pulled[3:])))
+    return RowBlocks(loss.rho(s), (gradient,), {(0, 0): hessian})
+
+
+def relative_pose_blocks(
+    blocks: tuple[Float[Tensor, "m 4 4"], Float[Tensor, "m 4 4"]],
+    constants: tuple[Float[Tensor, "m 4 4"]],
+    weight: Float[Tensor, "m 6"],
+    loss: Loss,
+) -> RowBlocks:
+    """`residuals.relative_pose` by the two poses."""
+    (R_from, p_from), (R_to, p_to) = _planes(blocks[0]), _planes(blocks[1])
+    R_measured, p_measured = _planes(constants[0])
+    step = _turn(R_from, p_to - p_from)
+    R_from_to = sum_of_products(R_from, R_to)
+    turned = _log(sum_of_products(R_measured, R_from_to))
+    error, w = torch.cat((step - p_measured, turned)), weight.mT
+    s = (error * w).square().sum(0)
+    square = w.square() * loss.weight(s)
+    pulled = square * error
+    # Rows of translation: -A and the cross product with the step for the first pose, A for the second. Rows of rotation:
+    # -B R_from_to^T for the first pose, B for the second.
+    A, B = R_from.transpose(0, 1), _right_jacobian_inverse(turned)
+    BC = sum_of_products(B.transpose(0, 1), R_from_to.transpose(0, 1))
+    S = _skew(step)
+    WA, WB, WS = A * square[:3, None], B * square[3:, None], S * square[:3, None]
+    along, turn_to = sum_of_products(WA, A), sum_of_products(WB, B)
+    by_to = along.new_zeros(6, 6, along.shape[2])
+    by_to[:3, :3], by_to[3:, 3:] = along, turn_to
+    across = torch.zeros_like(by_to)
+    swing = sum_of_products(WS, A)
+    across[:3, :3], across[3:, :3] = -along, swing
+    turn = sum_of_products(WB, BC)
+    across[3:, 3:] = -turn.transpose(0, 1)
+    by_from = torch.zeros_like(by_to)
+    by_from[:3, :3], by_from[3:, :3], by_from[:3, 3:] = along, -swing, -swing.transpose(0, 1)
+    by_from[3:, 3:] = sum_of_products(WS, S) + sum_of_products(BC * square[3:, None], BC)
+    shift = _turn(A, pulled[:3])
+    return RowBlocks(
+        loss.rho(s),
+        (
+            torch.cat((-shift, _turn(S, pulled[:3]) - _turn(BC, pulled[3:]))),
+            torch.cat((shift, _turn(B, pulled[3:]))),
+        ),
+        {(0, 0): by_from, (0, 1): across, (1, 1): by_to},
+    )
+
+
+def _planes(T: Float[Tensor, "m 4 4"]) -> tuple[Float[Tensor, "3 3 m"], Float[Tensor, "3 m"]]:
+    """Rotation and translation of transforms, rows last."""
+    planes = T[:, :3].permute(1, 2, 0).contiguous()
+    return planes[:, :3], planes[:, 3]
+
+
+def _skew(v: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
+    """The matrix of the cross product."""
+    S = v.new_zeros(3, 3, v.shape[1])
+    S[(2, 0, 1), (1, 2, 0)] = v
+    S[(1, 2, 0), (2, 0, 1)] = -v
+    return S
+
+
+def _log(R: Float[Tensor, "3 3 m"]) -> Float[Tensor, "3 m"]:
+    """Rotation vectors of rotation matrices."""
+    return se3.so3_log(R.permute(2, 0, 1)).mT
+
+
+def _right_jacobian_inverse(w: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
+    """`residuals.right_jacobian_inverse`, rows last."""
+    theta_sq = w.square().sum(0)
+    small = theta_sq < 1e-4
+    theta = torch.where(small, 1.0, theta_sq).sqrt()
+    closed = (1 - theta * (1 + theta.cos()) / (2 * theta.sin())) / theta.square()
+    factor = torch.where(small, 1 / 12 + theta_sq / 720, closed)
+    # W W = w w^T - |w|^2 I.
+    J = _skew(w / 2) + w[:, None] * w * factor
+    J[(0, 1, 2), (0, 1, 2)] += 1 - theta_sq * factor
+    return J
