@@ -221,11 +221,12 @@ def first_map(
         associations = without_signs(associations, copy)
         harvest = harvest_signs(journeys, starts, made, heads, associations, config.harvest)
         associations = harvest.associations
-        heads = with_evidence(heads, journeys, associations, config.harvest)
+        trusted = crowd.journey_weight > 0
+        heads = with_evidence(heads, journeys, associations, trusted, config.harvest)
         sure = existence(heads.n_journeys, passed, config.crowd.existence)
         heads = replace(heads, confidence=sure.to(heads.size))
         # What a bad drive alone saw is nothing to look for.
-        tentative = tentative[crowd.journey_weight[tentative.journey] > 0]
+        tentative = tentative[trusted[tentative.journey]]
         tentative = tentative[still_alone(tentative, made, associations)]
     return FirstMap(heads, lanes, tentative, crowd, associations, tuple(drifts), harvest)
 
@@ -268,7 +269,8 @@ def finish_map(
         made = [m.sign_tracklets for m in maps]
         again = harvest_signs(journeys, poses, made, signs, associations, config.harvest)
         associations = again.associations
-        signs = with_evidence(signs, journeys, associations, config.harvest)
+        trusted = first.crowd.journey_weight > 0
+        signs = with_evidence(signs, journeys, associations, trusted, config.harvest)
     associations = tuple(
         replace(
             association,

@@ -150,15 +150,19 @@ def with_evidence(
     signs: Signs,
     journeys: Sequence[Journey],
     associations: Sequence[Association],
+    trusted: Bool[Tensor, " j"],
     config: HarvestConfig,
 ) -> Signs:
-    """The signs with how often, by how many journeys and when they were seen, from the detections that show them."""
+    """The signs with how often, by how many journeys and when they were seen, from the detections that show them.
+
+    Only journeys that are `trusted` count.
+    """
     number = torch.arange(len(journeys), device=signs.shape.device)
     size = torch.tensor([len(a.sign) for a in associations], device=number.device)
     journey = torch.repeat_interleave(number, size)
     label = torch.cat([a.sign for a in associations])
     t_ns = torch.cat([j.t_ns[j.signs.frame] for j in journeys])
-    used = label >= 0
+    used = (label >= 0) & trusted[journey]
     label, t_ns = label[used], t_ns[used]
     owner, _, views = distinct_pairs(label, journey[used])
     return replace(

@@ -229,10 +229,15 @@ def test_evidence_counts_detections_and_the_journeys_that_saw_more_than_a_glimps
     second[torch.nonzero(drive.sign == 0)[:2, 0]] = 0
     second[drive.sign == 1] = 1
     journeys, _, associations = two_journeys(drive, second)
-    signs = with_evidence(map_of(drive), journeys, associations, CONFIG)
+    both = torch.tensor([True, True])
+    signs = with_evidence(map_of(drive), journeys, associations, both, CONFIG)
     views = torch.bincount(drive.sign)
     assert signs.n_journeys.tolist() == [1, 2, 1]
     assert signs.n_observations.tolist() == [int(views[0]) + 2, 2 * int(views[1]), int(views[2])]
+    first = torch.tensor([True, False])
+    signs = with_evidence(map_of(drive), journeys, associations, first, CONFIG)
+    assert signs.n_journeys.tolist() == [1, 1, 1]
+    assert signs.n_observations.tolist() == views.tolist()
 
 
 def test_singles_are_alone_until_most_of_their_detections_are_somewhere(drive: SignDrive):
