@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.geometry.camera import Camera
-from crowdmap_torch.observations import station
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.pose_drift import DriftConfig, knot_count
 from crowdmap_torch.road.level import Level, level_of
@@ -28,6 +27,9 @@ class CourseConfig:
 
     slide_sigma: float = 2.5e-3
     """1-sigma of the angle between course and wheels that comes and goes, over the way from knot to knot [rad]."""
+    blind_sigma: float = 1.3e-3
+    """1-sigma of the way sideways between two frames that no heading shows, over the square of their distance [1/m]: next
+    to nothing at a camera's rate, centimetres where frames are missing."""
     position_sigma_m: float = 0.016
     """White noise of positions from frame to frame."""
 
@@ -46,9 +48,11 @@ class DrivePath:
 
 def drive_path(journey: Journey, config: CourseConfig, drift: DriftConfig) -> DrivePath:
     """The way of a journey, and what its course says."""
-    T = journey.T_world_camera
-    way = station(T)
-    return DrivePath(T, way, journey.rig.camera, course_term(level_of(journey), way, config, drift))
+    level = level_of(journey)
+    # The furthest way ahead: noise at a stand makes no way, and a gap in the frames is as long as it is.
+    way = level.station.cummax(0)[0]
+    course = course_term(level, way, config, drift)
+    return DrivePath(journey.T_world_camera, way, journey.rig.camera, course)
 
 
 def course_term(
@@ -83,8 +87,10 @@ def course_term(
     habits = torch.cat((advance, swing), dim=-1) / 2
     by_before = torch.cat((-sideways, -turn, -habits), dim=-1)
     by_after = torch.cat((sideways, -turn, -habits), dim=-1)
+    blind = mean((config.blind_sigma * level.advance.square()).square().cumsum(0)[:, None])[:, 0]
     noise = config.position_sigma_m**2 * (1 / number[before] + 1 / number[after])
-    sigma = (noise + (config.slide_sigma * advance[:, 0]).square()).sqrt()
+    slide = (config.slide_sigma * advance[:, 0]).square()
+    sigma = (noise + slide + blind[after] - blind[before]).sqrt()
 
     def jacobian(a: Tensor, b: Tensor, *rows: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         error = rows[0] + (rows[1] * a + rows[2] * b).sum(-1)

@@ -127,3 +127,24 @@ def test_a_standing_car_has_no_course():
     path = path_of(poses)
     assert len(path.course) <= 1
     assert bool(path.station.isfinite().all()) and float(path.station.max()) == 0.0
+
+
+def test_a_gap_in_the_frames_is_not_reckoned_across():
+    poses = bend()
+    whole = path_of(poses)
+    path = path_of(torch.cat((poses[:100], poses[150:])))
+    assert float(path.station[-1]) == pytest.approx(float(whole.station[-1]), rel=0.02)
+    (_, before), (_, after) = path.course.slots
+    inside = torch.arange(int(52.0 / DRIFT.knot_m) + 1, int(72.0 / DRIFT.knot_m) + 1)
+    assert not bool(torch.isin(before, inside).any()) and not bool(torch.isin(after, inside).any())
+    assert len(path.course) >= len(whole.course) - len(inside) - 2
+
+
+def test_where_frames_are_missing_the_course_says_less():
+    poses = bend()
+    kept = torch.ones(len(poses), dtype=torch.bool)
+    kept[102:109] = False
+    path = path_of(poses[kept])
+    assert path.course.weight is not None
+    sigma = 1 / path.course.weight
+    assert float(sigma.max()) > 1.5 * float(sigma.median())

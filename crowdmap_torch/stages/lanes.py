@@ -75,9 +75,9 @@ class LaneConfig:
     """Share of a piece that the next one covers too."""
     control_points: int = 6
     """Of a whole piece; shorter ones have fewer, at the same spacing."""
-    max_gap_m: float = 15.0
-    """A marker without points over a longer way ends, and begins again behind it: dashes are
-    bridged."""
+    max_gap_m: float = 12.0
+    """A marker without points over a longer way ends, and begins again behind it: dashes are bridged,
+    intersections are not."""
     noise_px: float = 1.0
     """1-sigma of lane points."""
     normal_sigma: float = 1.5e-3

@@ -64,6 +64,9 @@ class SignTriangulationConfig:
     """Largest standard deviation of those."""
     size_m: tuple[float, float] = (0.1, 8.0)
     """Smallest and largest plausible width and height."""
+    min_side_m: float = 0.25
+    """Smallest plausible larger side: false detections that slide through the image of a creeping car look like tiny
+    plates before the lens."""
     confident_frames: float = 4.0
     """Views in agreement, weighted by their scores, at which the confidence reaches 1 - 1/e."""
     start_yaw_deg: tuple[float, ...] = (-30.0, 30.0)
@@ -277,6 +280,7 @@ def _fates(
         (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(config.min_parallax_deg)),
         (TOO_FAR, away[closest_view(away, views.sign)] > config.max_distance_m),
         (SIZE, ((fit.size < low) | (fit.size > high)).any(-1)),
+        (SIZE, fit.size.amax(-1) < config.min_side_m),
         (FEW_FRAMES, agreeing < config.min_frames),
         (RESIDUAL, agreeing < config.min_inlier_share * number),
         (RESIDUAL, scale > config.max_noise_scale),

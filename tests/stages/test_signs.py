@@ -172,6 +172,60 @@ def test_a_standing_car_maps_nothing_new():
     assert report.pruned["kept"] == 0 and sum(report.pruned.values()) == len(report.reason) == 6
 
 
+def test_a_false_run_before_a_creeping_car_is_no_sign():
+    """Detections that slide through the image while the car hardly moves look like a tiny plate before the lens."""
+    poses = straight_poses(20, step_m=0.08)
+    drive = drive_past(
+        poses, signs_at([(0.35, 2.4, 1.7)]), size=(0.15, 0.15), depth_m=(0.3, 10.0), noise_px=0.5
+    )
+    signs, report = mapped(drive.journey)
+    assert len(signs) == 0
+    assert report.pruned["implausible size"] == 1
+
+
+def out_and_back(frames: int = 90) -> torch.Tensor:
+    """A drive to the north, a turn to the left on the spot of a lane's width, and back to the south."""
+    out = straight_poses(frames)
+    turn = torch.linspace(0, torch.pi, 24, dtype=F64)[1:-1]
+    radius = 3.0
+    p = out[-1, :3, 3] + radius * torch.stack(
+        (turn.cos() - 1, turn.sin(), torch.zeros_like(turn)), dim=-1
+    )
+    zero = torch.zeros_like(turn)
+    R = out[-1, :3, :3] @ se3.so3_exp(torch.stack((zero, -turn, zero), dim=-1))
+    back = turn_about_up(torch.pi, (0.0, 0.0, 0.0)) @ out
+    back[:, :3, 3] += out[-1, :3, 3] * 2 - back[0, :3, 3] - out[-1, :3, 3]
+    back[:, 0, 3] -= 2 * radius
+    return torch.cat((out, se3.make(R, p), back))
+
+
+def test_a_u_turn_maps_each_sign_once():
+    """Signs that face the way out, and signs that face the way back; while the car turns all of them sweep by."""
+    poses = out_and_back()
+    facing_south = signs_at([(4.0, 40.0, 2.2), (4.5, 62.0, 2.5)])
+    facing_north = signs_at([(-10.0, 30.0, 2.2), (-10.5, 8.0, 2.4)], yaw_deg=180.0)
+    signs = torch.cat((facing_south, facing_north))
+    drive = drive_past(poses, signs, noise_px=0.4)
+    frame = drive.journey.signs.frame
+    towards = signs[drive.sign, :3, 3] - poses[frame, :3, 3]
+    is_front = (towards * signs[drive.sign, :3, 2]).sum(-1) < -0.3 * towards.norm(dim=-1)
+    drive = with_rows(drive, is_front.nonzero()[:, 0])
+    found, _ = mapped(drive.journey)
+    assert len(found) == 4
+    assert float(corner_errors(found, drive).max()) < 0.4
+
+
+def test_a_gap_in_the_frames_loses_no_sign():
+    """Two seconds without frames, the car going on: a sign seen before and after is one."""
+    poses = straight_poses(120)
+    kept = torch.cat((torch.arange(38), torch.arange(58, 120)))
+    drive = drive_past(poses[kept], signs_at([(3.5, 75.0, 2.2), (-4.0, 70.0, 2.0)]), noise_px=0.4)
+    drive = replace(drive, journey=replace(drive.journey, t_ns=kept * 10**8))
+    signs, _ = mapped(drive.journey)
+    assert len(signs) == 2
+    assert float(corner_errors(signs, drive).max()) < 0.4
+
+
 def test_a_sticker_on_the_car_ahead_is_no_sign(generator):
     """A detection that stands still in the image while the car drives."""
     poses = straight_poses(60)
