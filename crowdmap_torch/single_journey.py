@@ -17,6 +17,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.geometry import camera
 from crowdmap_torch.stages.associate import SignAssociator
 from crowdmap_torch.stages.associate_lanes import LaneAssociator
 from crowdmap_torch.stages.lanes import reconstruct_lanes
@@ -96,6 +97,7 @@ class SingleJourneyMapper:
         self._lane_labels: list[Tensor] = []
         self._roads: list[RoadEstimate] = []
         self._mapped_lanes = 0
+        _load_derivatives(rig)
 
     @property
     def frames_held(self) -> int:
@@ -240,6 +242,13 @@ class SingleJourneyMapper:
             self._roads,
         ):
             del held[:drop]
+
+
+def _load_derivatives(rig: Rig) -> None:
+    """Takes one derivative: torch loads its compiler with the first, a second that no step should have to wait."""
+    px = rig.camera.K[None, :2, 2]
+    ideal, _ = camera.unproject(rig.camera, px)
+    camera.observation_matrix(rig.camera, px, ideal)
 
 
 def _collected(promises: list[_Promise]) -> tuple[Signs | None, Lanes | None]:
