@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.optim.linearize import RowBlocks, sum_of_products
+from crowdmap_torch.optim.linearize import RowBlocks, RowGradients, sum_of_products
 from crowdmap_torch.optim.robust import Loss
 from crowdmap_torch.residuals import MIN_DEPTH
 
@@ -49,6 +49,27 @@ def point_reprojection_blocks(
         # Moving the camera one way is moving the point the other.
         {(0, 0): pose, (0, 1): -pose[:, :3], (1, 1): pose[:3, :3]},
     )
+
+
+def point_reprojection_gradient(
+    blocks: tuple[Float[Tensor, "m 4 4"], Float[Tensor, "m 3"]],
+    constants: tuple[Float[Tensor, "m 3 3"]],
+    weight: Float[Tensor, " m"],
+    loss: Loss,
+) -> RowGradients:
+    """The gradient alone of `point_reprojection_blocks`."""
+    R, p = _planes(blocks[0])
+    point = _turn(R, blocks[1].mT - p)
+    M = constants[0].permute(1, 2, 0).contiguous()
+    error, depth = _project(point, M)
+    error = error * weight
+    s = error.square().sum(0)
+    pulled = error * loss.weight(s)
+    by_camera = _by_camera(error, weight, depth, M)
+    force = (by_camera[0] * pulled[0]).addcmul_(by_camera[1], pulled[1])
+    by_point = (R[:, 0] * force[0]).addcmul_(R[:, 1], force[1]).addcmul_(R[:, 2], force[2])
+    by_turn = torch.linalg.cross(force, point, dim=0)
+    return RowGradients(loss.rho(s), (torch.cat((-by_point, by_turn)), by_point))
 
 
 def _turn(R_a_b: Float[Tensor, "3 3 m"], v_a: Float[Tensor, "3 m"]) -> Float[Tensor, "3 m"]:
@@ -105,6 +126,23 @@ def _pose_blocks(
     return hessian, gradient, loss.rho(s)
 
 
+def pose_prior(
+    T_world_camera: Float[Tensor, "m 4 4"], prior: Float[Tensor, "m 4 4"]
+) -> Float[Tensor, "m 6"]:
+    """`residuals.pose_prior` of many rows."""
+    return _deviation(_planes(prior), _planes(T_world_camera)).mT
+
+
+def relative_pose(
+    T_world_from: Float[Tensor, "m 4 4"],
+    T_world_to: Float[Tensor, "m 4 4"],
+    measured: Float[Tensor, "m 4 4"],
+) -> Float[Tensor, "m 6"]:
+    """`residuals.relative_pose` of many rows."""
+    step = _step(_planes(T_world_from), _planes(T_world_to))
+    return _deviation(_planes(measured), step).mT
+
+
 def pose_prior_blocks(
     blocks: tuple[Float[Tensor, "m 4 4"]],
     constants: tuple[Float[Tensor, "m 4 4"]],
@@ -112,10 +150,8 @@ def pose_prior_blocks(
     loss: Loss,
 ) -> RowBlocks:
     """`residuals.pose_prior` by the pose."""
-    R, p = _planes(blocks[0])
-    R_prior, p_prior = _planes(constants[0])
-    turned = _log(sum_of_products(R_prior, R))
-    error, w = torch.cat((p - p_prior, turned)), weight.mT
+    error, w = _deviation(_planes(constants[0]), _planes(blocks[0])), weight.mT
+    turned = error[3:]
     s = (error * w).square().sum(0)
     square = w.square() * loss.weight(s)
     B = _right_jacobian_inverse(turned)
@@ -134,12 +170,10 @@ def relative_pose_blocks(
     loss: Loss,
 ) -> RowBlocks:
     """`residuals.relative_pose` by the two poses."""
-    (R_from, p_from), (R_to, p_to) = _planes(blocks[0]), _planes(blocks[1])
-    R_measured, p_measured = _planes(constants[0])
-    step = _turn(R_from, p_to - p_from)
-    R_from_to = sum_of_products(R_from, R_to)
-    turned = _log(sum_of_products(R_measured, R_from_to))
-    error, w = torch.cat((step - p_measured, turned)), weight.mT
+    R_from, _ = T_from = _planes(blocks[0])
+    R_from_to, step = moved = _step(T_from, _planes(blocks[1]))
+    error, w = _deviation(_planes(constants[0]), moved), weight.mT
+    turned = error[3:]
     s = (error * w).square().sum(0)
     square = w.square() * loss.weight(s)
     pulled = square * error
@@ -177,6 +211,20 @@ def _planes(T: Float[Tensor, "m 4 4"]) -> tuple[Float[Tensor, "3 3 m"], Float[Te
     return planes[:, :3], planes[:, 3]
 
 
+def _step(
+    T_world_from: tuple[Tensor, Tensor], T_world_to: tuple[Tensor, Tensor]
+) -> tuple[Float[Tensor, "3 3 m"], Float[Tensor, "3 m"]]:
+    """Rotation and translation of the second frame in the first."""
+    (R_from, p_from), (R_to, p_to) = T_world_from, T_world_to
+    return sum_of_products(R_from, R_to), _turn(R_from, p_to - p_from)
+
+
+def _deviation(T_from: tuple[Tensor, Tensor], T_to: tuple[Tensor, Tensor]) -> Float[Tensor, "6 m"]:
+    """`se3.local`, rows last."""
+    (R_from, p_from), (R_to, p_to) = T_from, T_to
+    return torch.cat((p_to - p_from, _log(sum_of_products(R_from, R_to))))
+
+
 def _skew(v: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
     """The matrix of the cross product."""
     S = v.new_zeros(3, 3, v.shape[1])
@@ -187,16 +235,29 @@ def _skew(v: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
 
 def _log(R: Float[Tensor, "3 3 m"]) -> Float[Tensor, "3 m"]:
     """Rotation vectors of rotation matrices."""
-    return se3.so3_log(R.permute(2, 0, 1)).mT
+    # R - R^T is twice the sine of the angle about the axis: sound up to a right angle, and no square root needed there.
+    twice = torch.stack((R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]))
+    cosine = (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2
+    if bool((cosine < 0.1).any()):
+        return se3.so3_log(R.permute(2, 0, 1)).mT
+    sine = twice.square().sum(0).sqrt() / 2
+    small = sine < 1e-4
+    angle = torch.atan2(sine, cosine)
+    return (
+        twice / 2 * torch.where(small, 1 + sine.square() / 6, angle / torch.where(small, 1.0, sine))
+    )
 
 
 def _right_jacobian_inverse(w: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
     """`residuals.right_jacobian_inverse`, rows last."""
     theta_sq = w.square().sum(0)
-    small = theta_sq < 1e-4
-    theta = torch.where(small, 1.0, theta_sq).sqrt()
-    closed = (1 - theta * (1 + theta.cos()) / (2 * theta.sin())) / theta.square()
-    factor = torch.where(small, 1 / 12 + theta_sq / 720, closed)
+    # Bernoulli numbers' series: the next term is below 1e-13 up to a tenth of a radian.
+    factor = 1 / 12 + theta_sq * (1 / 720 + theta_sq * (1 / 30240 + theta_sq / 1209600))
+    small = theta_sq < 0.01
+    if not bool(small.all()):
+        theta = torch.where(small, 1.0, theta_sq).sqrt()
+        closed = (1 - theta * (1 + theta.cos()) / (2 * theta.sin())) / theta.square()
+        factor = torch.where(small, factor, closed)
     # W W = w w^T - |w|^2 I.
     J = _skew(w / 2) + w[:, None] * w * factor
     J[(0, 1, 2), (0, 1, 2)] += 1 - theta_sq * factor

@@ -10,7 +10,7 @@ import torch
 from crowdmap_torch import residual_blocks, residuals
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.optim.linearize import residuals as whitened
-from crowdmap_torch.optim.linearize import row_blocks
+from crowdmap_torch.optim.linearize import row_blocks, row_gradients
 from crowdmap_torch.optim.problem import CostTerm, Variable, euclidean
 from crowdmap_torch.optim.robust import Huber, Quadratic, Tukey
 
@@ -44,6 +44,7 @@ def corner_term(loss):
             loss,
             batched=residual_blocks.point_reprojection,
             normal=residual_blocks.point_reprojection_blocks,
+            gradient=residual_blocks.point_reprojection_gradient,
         ),
         values,
     )
@@ -52,8 +53,9 @@ def corner_term(loss):
 def prior_term(loss):
     values = {"pose": poses(0)}
     prior = se3.retract(values["pose"], draw(5, ROWS, 6, scale=0.4))
-    # Right at the prior, where angles vanish.
+    # Right at the prior, where angles vanish, and far from it.
     prior[0] = values["pose"][0]
+    prior[1] = se3.retract(prior[1], torch.tensor([0.0, 0, 0, 2.0, 1.0, 0], dtype=torch.float64))
     return (
         CostTerm(
             residuals.pose_prior,
@@ -61,6 +63,7 @@ def prior_term(loss):
             (prior,),
             1 + draw(4, ROWS, 6).abs(),
             loss,
+            batched=residual_blocks.pose_prior,
             normal=residual_blocks.pose_prior_blocks,
         ),
         values,
@@ -79,6 +82,7 @@ def relative_term(loss):
             (measured,),
             1 + draw(4, ROWS - 1, 6).abs(),
             loss,
+            batched=residual_blocks.relative_pose,
             normal=residual_blocks.relative_pose_blocks,
         ),
         values,
@@ -99,8 +103,20 @@ def test_blocks_are_those_of_autograd(make, loss):
         torch.testing.assert_close(block, theirs.hessian[pair], rtol=1e-9, atol=1e-9)
 
 
-def test_residuals_of_many_rows_are_those_of_one():
-    term, values = corner_term(Quadratic())
+@pytest.mark.parametrize("loss", [Quadratic(), Tukey(30.0)])
+@pytest.mark.parametrize("make", [corner_term, prior_term, relative_term])
+def test_gradients_alone_are_those_of_the_blocks(make, loss):
+    term, values = make(loss)
+    alone = row_gradients(term, VARIABLES, values)
+    blocks = row_blocks(term, VARIABLES, values)
+    torch.testing.assert_close(alone.rho, blocks.rho)
+    for mine, other in zip(alone.gradient, blocks.gradient, strict=True):
+        torch.testing.assert_close(mine, other)
+
+
+@pytest.mark.parametrize("make", [corner_term, prior_term, relative_term])
+def test_residuals_of_many_rows_are_those_of_one(make):
+    term, values = make(Quadratic())
     torch.testing.assert_close(
         whitened(term, values), whitened(replace(term, batched=None), values)
     )

@@ -8,15 +8,24 @@ arithmetic.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.chain_structure import Batch, ChainStructure, Coupling, Level, analyse
+from crowdmap_torch.optim.chain_structure import Batch, ChainStructure, Coupling, analyse
 from crowdmap_torch.optim.linear import DIAGONAL_FLOOR, Step, unpack
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, chunks, row_blocks, rows
+from crowdmap_torch.optim.linearize import (
+    CHUNK_ROWS,
+    RowBlocks,
+    RowGradients,
+    chunks,
+    row_blocks,
+    row_gradients,
+    rows,
+)
+from crowdmap_torch.optim.parallel import in_order
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values
 
 
@@ -42,13 +51,19 @@ class ChainBackend:
     chunk_rows: int = CHUNK_ROWS
     _problem: Problem | None = field(default=None, repr=False)
     _structure: ChainStructure | None = field(default=None, repr=False)
-    _store: Tensor | None = field(default=None, repr=False)
+    _workspace: _Workspace | None = field(default=None, repr=False)
 
     def assemble(self, problem: Problem, values: Values) -> ChainNormalEquations:
         """Normal equations at `values`; memory beyond them is bounded by the chunk.
 
         The workspace of the solve is the backend's: of its normal equations only the last may be solved.
         """
+        self.prepare(problem, values)
+        assert self._structure is not None and self._workspace is not None
+        return _assemble(problem, values, self._structure, self._workspace, self.chunk_rows)
+
+    def prepare(self, problem: Problem, values: Values) -> None:
+        """Works the structure out and takes the workspace, unless both are there for such a problem."""
         if self._structure is None or not _same_rows(problem, self._problem):
             if problem.group_count != 1:
                 raise ValueError("chains are eliminated in one problem at a time, not in a batch")
@@ -65,9 +80,7 @@ class ChainBackend:
             self._problem = problem
             block = values[self.eliminate]
             k = problem.variables[self.eliminate].tangent_dim
-            self._store = block.new_empty(self._structure.store_rows + 1, k)
-        assert self._store is not None
-        return _assemble(problem, values, self._structure, self._store, self.chunk_rows)
+            self._workspace = _Workspace(block.new_empty(self._structure.store_rows + 1, k))
 
 
 def _same_rows(problem: Problem, other: Problem | None) -> bool:
@@ -83,14 +96,26 @@ def _same_rows(problem: Problem, other: Problem | None) -> bool:
     )
 
 
-@dataclass(frozen=True)
-class _Reduced:
-    """The reduced system, and what back-substitution needs beside the boundary store."""
+@dataclass
+class _Workspace:
+    """What the solves of one back end share: memory is taken once."""
 
-    matrix: Float[Tensor, "r r"]
-    right_side: Float[Tensor, " r"]
+    store: Float[Tensor, "rows k"]
+    """Per eliminated block and column of its window a row of `k`; once eliminated, times its inverse diagonal."""
+    factor: _Factor | None = None
+    """Of the last solve."""
+
+
+@dataclass(frozen=True)
+class _Factor:
+    """The factorised matrix, together with the boundary store."""
+
+    inverses: list[Float[Tensor, "e k k"]]
+    """By batch: inverse diagonals."""
     towards: list[Float[Tensor, "e k sk"]]
-    """By level: every block's inverse diagonal times its links to its neighbours."""
+    """By batch: minus the inverse diagonals times the links to the neighbours."""
+    reduced: Float[Tensor, "r r"]
+    """Cholesky factor of the reduced system."""
 
 
 @dataclass(frozen=True)
@@ -107,38 +132,90 @@ class ChainNormalEquations:
     coupling: Mapping[str, Float[Tensor, "f l k"]]
     hessian: Float[Tensor, "r r"]
     gradient: Float[Tensor, " r"]
-    store: Float[Tensor, "rows k"] = field(repr=False)
-    """Workspace: per block and column of its window a row of `k`, overwritten by every solve."""
+    workspace: _Workspace = field(repr=False)
+    factorised: bool = False
+    """Whether the last solve's factors are to be used as they are: those of another point, for this gradient."""
+
+    def moved(self, problem: Problem, values: Values) -> ChainNormalEquations:
+        """Cost and gradient at other values, with the matrix as the last solve factorised it."""
+        sums = _Sums(self.structure, self.chain_gradient, hessian=None)
+        term_cost = {}
+        kinds = dict(problem.variables)
+        for name, term in problem.terms.items():
+            cost = torch.zeros_like(self.cost)
+            pieces = [piece for _, piece in chunks(term)]
+            parts = in_order(lambda piece: row_gradients(piece, kinds, values), pieces, cost.device)
+            for piece, part in zip(pieces, parts, strict=True):
+                cost += part.rho.sum() / 2
+                sums.add_gradient(piece, part)
+            term_cost[name] = cost
+        return replace(
+            self,
+            cost=torch.stack(list(term_cost.values())).sum(0),
+            term_cost=term_cost,
+            chain_gradient=sums.chain_gradient.mT.contiguous(),
+            gradient=sums.gradient(),
+            factorised=True,
+        )
+
+    def slope(self, delta: Mapping[str, Tensor]) -> Float[Tensor, " 1"]:
+        """Derivative of the cost along `delta`."""
+        of = unpack(self.gradient[None], self.structure.where)
+        of.update(self._unstack(self.chain_gradient))
+        return torch.stack([(of[name] * delta[name]).sum() for name in delta]).sum()[None]
 
     def solve(self, damping: Float[Tensor, " 1"]) -> Step:
         """The damped step: eliminate level by level, solve what is left, substitute back."""
+        if self.factorised:
+            return self._solve_again()
         scale = damping[0]
         added_chain = scale * self.diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(DIAGONAL_FLOOR)
         added = scale * self.hessian.diagonal().clamp_min(DIAGONAL_FLOOR)
-        reduced = self._reduce(added_chain, added)
-        if reduced is None:
+        matrix, right_side, inverses, towards = self._reduce(added_chain, added)
+        reduced, failed = torch.linalg.cholesky_ex(matrix)
+        if bool(failed) or not bool(matrix.isfinite().all()):
             return self._failed()
-        factor, failed = torch.linalg.cholesky_ex(reduced.matrix)
-        if bool(failed):
-            return self._failed()
-        packed = -torch.cholesky_solve(reduced.right_side[:, None], factor)[:, 0]
-        chain_step = self._substitute(packed, reduced.towards)
+        factor = self.workspace.factor = _Factor(inverses, towards, reduced)
+        packed = -torch.cholesky_solve(right_side[:, None], reduced)[:, 0]
+        chain_step = self._substitute(packed, factor)
         along = (self.chain_gradient * chain_step).sum() + self.gradient @ packed
         damped = (added_chain * chain_step.square()).sum() + added @ packed.square()
+        return self._step(packed, chain_step, (damped - along) / 2)
+
+    def _solve_again(self) -> Step:
+        """The step for this gradient by the factors of the last solve."""
+        factor, structure = self.workspace.factor, self.structure
+        assert factor is not None
+        gradient = self.gradient.new_zeros(len(structure.order), self.chain_gradient.shape[1])
+        gradient[structure.place] = self.chain_gradient
+        right_side = torch.nn.functional.pad(self.gradient, (0, 2))
+        batches = [batch for level in structure.levels for batch in level.batches]
+        for batch, leads in zip(batches, factor.towards, strict=True):
+            groups, size, w, _ = batch.fill.shape
+            own = gradient[batch.place][..., None]
+            seen = (_rows(batch, self.workspace.store) @ own).view(groups, size, w).sum(1)
+            right_side.index_add_(0, batch.columns.flatten(), -seen.flatten())
+            passed = (leads.mT @ own).view(-1, own.shape[1])
+            gradient.index_add_(0, batch.neighbour.flatten(), passed)
+        packed = -torch.cholesky_solve(right_side[: len(self.gradient), None], factor.reduced)[:, 0]
+        chain_step = self._substitute(packed, factor, gradient)
+        along = (self.chain_gradient * chain_step).sum() + self.gradient @ packed
+        return self._step(packed, chain_step, -along / 2)
+
+    def _step(self, packed: Tensor, chain_step: Tensor, predicted: Tensor) -> Step:
         delta = unpack(packed[None], self.structure.where)
         delta.update(self._unstack(chain_step))
         norm = (chain_step.square().sum() + packed.square().sum()).sqrt()
-        solved = norm.isfinite()
-        return Step(delta, ((damped - along) / 2)[None], solved[None], norm[None])
+        return Step(delta, predicted[None], norm.isfinite()[None], norm[None])
 
     def marginal_covariance(self, *, floor: float = 1e-9) -> Float[Tensor, "r r"]:
         """Covariance of all variables but the eliminated one, jointly, the eliminated one marginalised."""
         nothing = torch.zeros_like(self.diagonal[..., 0])
         # The floor keeps a landmark that nothing observes invertible; its variance says so.
-        reduced = self._reduce(nothing, torch.full_like(self.gradient, floor))
-        if reduced is None:
+        matrix, *_ = self._reduce(nothing, torch.full_like(self.gradient, floor))
+        if not bool(matrix.isfinite().all()):
             raise ValueError("the chain's blocks are not positive definite without damping")
-        return torch.cholesky_inverse(torch.linalg.cholesky(reduced.matrix))
+        return torch.cholesky_inverse(torch.linalg.cholesky(matrix))
 
     def _unstack(self, stacked: Tensor) -> dict[str, Tensor]:
         """Rows of the leaves and of the chain, by variable."""
@@ -152,9 +229,14 @@ class ChainNormalEquations:
         zero = torch.zeros_like(self.cost)
         return Step(delta, zero, torch.zeros_like(zero, dtype=torch.bool), zero)
 
-    def _reduce(self, added_chain: Tensor, added: Tensor) -> _Reduced | None:
-        """The Schur complement on the landmarks and its right-hand side; the eliminated rows are in the store."""
-        structure, store = self.structure, self.store
+    def _reduce(
+        self, added_chain: Tensor, added: Tensor
+    ) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor]]:
+        """The Schur complement on the landmarks and its right-hand side; inverse diagonals and leads, by batch.
+
+        The eliminated rows are in the store. What is not positive definite gives numbers that are not finite.
+        """
+        structure, store = self.structure, self.workspace.store
         store.zero_()
         for name, block in self.coupling.items():
             store.index_add_(0, structure.factor_rows[name], block.flatten(0, 1))
@@ -169,48 +251,52 @@ class ChainNormalEquations:
         diagonal = torch.cat((self.diagonal + torch.diag_embed(added_chain), none))
         diagonal = diagonal[structure.order]
         link = torch.cat((self.link, torch.zeros_like(none)))[structure.order]
-        towards = []
+        inverses, towards = [], []
         for level in structure.levels:
-            factor, failed = torch.linalg.cholesky_ex(diagonal[level.place])
-            if bool(failed.any()):
-                return None
-            inverse = torch.cholesky_inverse(factor)
-            links = link[level.place]
-            if level.neighbour.shape[1] == 2:
-                links = torch.cat((link[level.neighbour[:, 0]].mT, links), dim=-1)
-            leads = inverse @ -links
-            towards.append(leads)
-            _pass_on(level, links.mT @ leads, diagonal, link)
-            for batch in level.batches:
-                mine = slice(
-                    batch.place.start - level.place.start, batch.place.stop - level.place.start
-                )
-                _eliminate(batch, inverse[mine], leads[mine], store, system)
-        return _Reduced(system[:dim, :dim], system[dim, :dim], towards)
+            parts = in_order(
+                lambda batch: _eliminate(batch, diagonal, link, store, len(system)),
+                level.batches,
+                store.device,
+            )
+            for batch, part in zip(level.batches, parts, strict=True):
+                inverses.append(part.inverse)
+                towards.append(part.towards)
+                _pass_on(batch, part.square, diagonal, link)
+                system.view(-1).index_add_(0, part.at, part.product)
+                store.index_add_(0, batch.fill.flatten(), part.fill)
+        return system[:dim, :dim], system[dim, :dim], inverses, towards
 
-    def _substitute(self, packed: Tensor, towards: list[Tensor]) -> Tensor:
-        """Steps of the eliminated blocks, from the last level to the first."""
+    def _substitute(
+        self, packed: Tensor, factor: _Factor, gradient: Tensor | None = None
+    ) -> Tensor:
+        """Steps of the eliminated blocks, from the last level to the first.
+
+        Their gradient is that of the store, or else `gradient`, in the order of elimination.
+        """
         structure, k = self.structure, self.chain_gradient.shape[1]
         # The gradient's column counts once, padding not at all.
-        known = torch.cat((packed, packed.new_tensor([1.0, 0.0])))
+        known = torch.cat((packed, packed.new_tensor([float(gradient is None), 0.0])))
         step = packed.new_zeros(len(structure.order), k)
-        for level, leads in zip(reversed(structure.levels), reversed(towards), strict=True):
-            for batch in level.batches:
-                size = batch.fill.shape[1]
-                window = known[batch.columns].repeat_interleave(size, 0)[:, None]
-                torch.bmm(window, _rows(batch, self.store), out=step[batch.place][:, None])
-            beside = step[level.neighbour].flatten(1)[..., None]
-            step[level.place] = (leads @ beside)[..., 0] - step[level.place]
+        batches = [batch for level in structure.levels for batch in level.batches]
+        by_batch = list(zip(batches, factor.inverses, factor.towards, strict=True))
+        for batch, inverse, leads in reversed(by_batch):
+            size = batch.fill.shape[1]
+            window = known[batch.columns].repeat_interleave(size, 0)[:, None]
+            own = (window @ _rows(batch, self.workspace.store)).mT
+            if gradient is not None:
+                own = own + inverse @ gradient[batch.place][..., None]
+            beside = step[batch.neighbour].flatten(1)[..., None]
+            step[batch.place] = (leads @ beside - own)[..., 0]
         return step[structure.place]
 
 
-def _pass_on(level: Level, square: Tensor, diagonal: Tensor, link: Tensor) -> None:
+def _pass_on(batch: Batch, square: Tensor, diagonal: Tensor, link: Tensor) -> None:
     """What the blocks that go leave on the diagonals and links of their neighbours, in place."""
-    e, sides, k = len(level.neighbour), level.neighbour.shape[1], diagonal.shape[-1]
+    (e, sides), k = batch.neighbour.shape, diagonal.shape[-1]
     own = square.view(e, sides, k, sides, k).diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
-    diagonal.view(-1, k * k).index_add_(0, level.neighbour.flatten(), own.reshape(-1, k * k))
+    diagonal.view(-1, k * k).index_add_(0, batch.neighbour.flatten(), own.reshape(-1, k * k))
     if sides == 2:
-        link[level.neighbour[:, 0]] = square[:, :k, k:]
+        link[batch.neighbour[:, 0]] = square[:, :k, k:]
 
 
 def _rows(batch: Batch, store: Tensor) -> Tensor:
@@ -220,67 +306,88 @@ def _rows(batch: Batch, store: Tensor) -> Tensor:
     return rows.view(groups * size, w, store.shape[-1])
 
 
-def _eliminate(batch: Batch, inverse: Tensor, leads: Tensor, store: Tensor, system: Tensor) -> None:
-    """Eliminates a batch: into the reduced system, into its neighbours' rows, its own rows solved; in place."""
-    groups, size, w, _ = batch.fill.shape
+@dataclass(frozen=True)
+class _Part:
+    """What the elimination of a batch leaves to others."""
+
+    inverse: Float[Tensor, "e k k"]
+    towards: Float[Tensor, "e k sk"]
+    """Minus the inverse diagonals times the links to the neighbours."""
+    square: Float[Tensor, "sk sk"]
+    """To be added to the neighbours' diagonals and to the link between them."""
+    at: Int[Tensor, " ww"]
+    product: Float[Tensor, " ww"]
+    """To be added to the reduced system, and where."""
+    fill: Float[Tensor, "rows k"]
+    """To be added to the neighbours' rows."""
+
+
+def _eliminate(batch: Batch, diagonal: Tensor, link: Tensor, store: Tensor, stride: int) -> _Part:
+    """What a batch leaves behind; its own rows are solved in place."""
+    groups, size, w, sides = batch.fill.shape
     k = store.shape[-1]
+    # A block that is not positive definite gives what is not finite, and the whole step fails.
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(diagonal[batch.place]).L)
+    links = link[batch.place]
+    if sides == 2:
+        links = torch.cat((link[batch.neighbour[:, 0]].mT, links), dim=-1)
+    leads = (inverse @ links).neg_()
     rows = _rows(batch, store)
     solved = rows @ inverse
     left = rows.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
     right = solved.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
-    at = batch.columns[:, :, None] * len(system) + batch.columns[:, None]
-    system.view(-1).index_add_(0, at.flatten(), (left @ right.mT).flatten(), alpha=-1)
+    at = (batch.columns[:, :, None] * stride + batch.columns[:, None]).flatten()
+    product = (left @ right.mT).neg_().flatten()
     # Adding rows as they are is several times faster than subtracting them: the leads carry the sign.
-    store.index_add_(0, batch.fill.flatten(), (rows @ leads).view(-1, k))
+    fill = (rows @ leads).view(-1, k)
     rows.copy_(solved)
+    return _Part(inverse, leads, links.mT @ leads, at, product, fill)
 
 
 def _assemble(
-    problem: Problem, values: Values, structure: ChainStructure, store: Tensor, chunk_rows: int
+    problem: Problem,
+    values: Values,
+    structure: ChainStructure,
+    workspace: _Workspace,
+    chunk_rows: int,
 ) -> ChainNormalEquations:
     base, kinds = structure.base, dict(problem.variables)
     n, blocks = len(structure.chain), values[next(iter(base))]
     k = problem.variables[next(iter(base))].tangent_dim
-    # Rows last while they are summed, as they come.
-    diagonal = blocks.new_zeros(k * k, n)
-    chain_gradient = blocks.new_zeros(k, n)
+    sums = _Sums(structure, blocks.new_zeros(n, k), hessian=blocks.new_zeros(k * k, n))
     link = blocks.new_zeros(n, k, k)
-    landmarks = _LandmarkSums(structure, blocks)
     term_cost, couplings = {}, {}
 
     for name, term in problem.terms.items():
         cost = blocks.new_zeros(1)
         coupling = structure.couplings.get(name)
-        if coupling is not None and coupling.order is not None:
-            term = rows(term, coupling.order)
         if coupling is not None:
             couplings[name] = blocks.new_zeros(len(coupling.block), coupling.column.shape[1], k)
-        for at, piece in chunks(term, chunk_rows):
-            part = row_blocks(piece, kinds, values)
+            term = term if coupling.order is None else rows(term, coupling.order)
+        pieces = list(chunks(term, chunk_rows))
+        parts = in_order(lambda piece: row_blocks(piece[1], kinds, values), pieces, blocks.device)
+        for (at, piece), part in zip(pieces, parts, strict=True):
             cost += part.rho.sum() / 2
-            chained = [i for i, (slot, _) in enumerate(piece.slots) if slot in base]
-            index = [piece.slots[i][1] + base[piece.slots[i][0]] for i in chained]
-            for i, block in zip(chained, index, strict=True):
-                diagonal.index_add_(1, block, part.hessian[i, i].flatten(0, 1))
-                chain_gradient.index_add_(1, block, part.gradient[i])
-            if len(chained) == 2:
+            sums.add_gradient(piece, part)
+            sums.add_hessian(piece, part)
+            index = [block + base[slot] for slot, block in piece.slots if slot in base]
+            if len(index) == 2:
                 _add_link(link, structure, index[0], index[1], part.hessian[0, 1].permute(2, 0, 1))
             if coupling is not None:
                 _add_mixed(couplings[name], coupling, at, part)
-            landmarks.add(piece, part)
         term_cost[name] = cost
-    total = torch.stack(list(term_cost.values())).sum(0)
+    assert sums.diagonal is not None
     return ChainNormalEquations(
-        total,
+        torch.stack(list(term_cost.values())).sum(0),
         term_cost,
         structure,
-        diagonal.mT.reshape(n, k, k),
+        sums.diagonal.mT.reshape(n, k, k),
         link,
-        chain_gradient.mT.contiguous(),
+        sums.chain_gradient.mT.contiguous(),
         couplings,
-        landmarks.hessian(),
-        landmarks.gradient(),
-        store,
+        sums.hessian(),
+        sums.gradient(),
+        workspace,
     )
 
 
@@ -300,41 +407,58 @@ def _add_mixed(mixed: Tensor, coupling: Coupling, at: slice, part: RowBlocks) ->
             mixed[:, here].index_add_(0, coupling.factor_of_row[at], cross)
 
 
-class _LandmarkSums:
-    """Gradient and Hessian of the variables that stay, summed by block before they go into one matrix."""
+class _Sums:
+    """Gradient and Hessian, summed by block, rows last, before the landmarks' go into one matrix."""
 
-    def __init__(self, structure: ChainStructure, like: Tensor) -> None:
+    def __init__(
+        self, structure: ChainStructure, chain_gradient: Tensor, *, hessian: Tensor | None
+    ) -> None:
         where = structure.where
-        self.offset, self.dim, self.like = where.offset, where.dim, like
+        self.base, self.offset, self.dim = structure.base, where.offset, where.dim
+        like = chain_gradient
+        self.chain_gradient = torch.zeros_like(like.mT, memory_format=torch.contiguous_format)
+        self.diagonal = hessian
         sizes = {name: (where.tangent_dim[name], len(at)) for name, at in self.offset.items()}
         self.gradients = {name: like.new_zeros(k, n) for name, (k, n) in sizes.items()}
-        self.squares = {name: like.new_zeros(k * k, n) for name, (k, n) in sizes.items()}
-        self.matrix = like.new_zeros(self.dim, self.dim)
+        if hessian is not None:
+            self.squares = {name: like.new_zeros(k * k, n) for name, (k, n) in sizes.items()}
+            self.matrix = like.new_zeros(self.dim, self.dim)
 
-    def add(self, piece: CostTerm, part: RowBlocks) -> None:
-        """Adds the rows' blocks among landmarks."""
-        stays = [i for i, (slot, _) in enumerate(piece.slots) if slot in self.offset]
-        for i in stays:
-            name, index = piece.slots[i]
-            self.gradients[name].index_add_(1, index, part.gradient[i])
-            self.squares[name].index_add_(1, index, part.hessian[i, i].flatten(0, 1))
+    def add_gradient(self, piece: CostTerm, part: RowGradients) -> None:
+        """Adds the rows' gradients."""
+        for (name, index), gradient in zip(piece.slots, part.gradient, strict=True):
+            if name in self.base:
+                self.chain_gradient.index_add_(1, index + self.base[name], gradient)
+            else:
+                self.gradients[name].index_add_(1, index, gradient)
+
+    def add_hessian(self, piece: CostTerm, part: RowBlocks) -> None:
+        """Adds the rows' blocks but those with one or two eliminated slots."""
+        assert self.diagonal is not None
+        stays = []
+        for i, (name, index) in enumerate(piece.slots):
+            square = part.hessian[i, i].flatten(0, 1)
+            if name in self.base:
+                self.diagonal.index_add_(1, index + self.base[name], square)
+                continue
+            self.squares[name].index_add_(1, index, square)
             for j in stays:
-                if i < j:
-                    other, index_j = piece.slots[j]
-                    at, at_j = self.offset[name][index], self.offset[other][index_j]
-                    self._scatter(at, at_j, part.hessian[i, j])
-                    self._scatter(at_j, at, part.hessian[i, j].transpose(0, 1))
+                other, index_j = piece.slots[j]
+                at, at_j = self.offset[name][index], self.offset[other][index_j]
+                self._scatter(at_j, at, part.hessian[j, i])
+                self._scatter(at, at_j, part.hessian[j, i].transpose(0, 1))
+            stays.append(i)
 
     def hessian(self) -> Tensor:
-        """The Hessian [dim, dim]."""
+        """The landmarks' Hessian [dim, dim]."""
         for name, square in self.squares.items():
             k = len(self.gradients[name])
             self._scatter(self.offset[name], self.offset[name], square.view(k, k, -1))
         return self.matrix
 
     def gradient(self) -> Tensor:
-        """The gradient [dim]."""
-        packed = self.like.new_zeros(self.dim)
+        """The landmarks' gradient [dim]."""
+        packed = self.chain_gradient.new_zeros(self.dim)
         for name, gradient in self.gradients.items():
             at = self.offset[name] + torch.arange(len(gradient), device=packed.device)[:, None]
             packed[at] = gradient

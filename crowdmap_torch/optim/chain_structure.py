@@ -49,6 +49,9 @@ class Batch:
 
     place: slice
     """Places of the order of elimination, group by group."""
+    neighbour: Int[Tensor, "e s"]
+    """Places of the blocks that each is linked to: before and behind it in the chain, or a leaf's carrier; the
+    last place of all for none."""
     columns: Int[Tensor, "b w"]
     """The windows: columns of the reduced system; first its gradient, `dim`, and `dim + 1` for padding."""
     fill: Int[Tensor, "b g w s"]
@@ -61,11 +64,6 @@ class Batch:
 class Level:
     """One round of elimination."""
 
-    place: slice
-    """Places of the order of elimination."""
-    neighbour: Int[Tensor, "e s"]
-    """Places of the blocks that each is linked to: before and behind it in the chain, or a leaf's carrier; the
-    last place of all for none."""
     batches: tuple[Batch, ...]
 
 
@@ -384,16 +382,15 @@ class _Builder:
             (self.n + 1, neighbour.shape[1]), self.n, dtype=torch.long, device=node.device
         )
         towards[node] = neighbour
-        first = self.places
-        built, neighbours = [], []
+        built = []
         for nodes, columns in batches:
             heir = towards[nodes]
             fill = self._fill_rows(columns, heir)
             here = slice(self.places, self.places + nodes.numel())
             self.places = here.stop
-            built.append(Batch(here, columns, fill, self.batch_rows.pop(0)))
-            neighbours.append(place[heir].flatten(0, 1))
-        return Level(slice(first, self.places), torch.cat(neighbours), tuple(built))
+            beside = place[heir].flatten(0, 1)
+            built.append(Batch(here, beside, columns, fill, self.batch_rows.pop(0)))
+        return Level(tuple(built))
 
     def _fill_rows(self, columns: Tensor, heir: Tensor) -> Tensor:
         """Store rows [b, g, w, s] of the windows' columns at the heirs [b, g, s]."""

@@ -14,13 +14,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.linear import Backend, DenseBackend, NormalEquations
+from crowdmap_torch.optim.linear import (
+    Backend,
+    DenseBackend,
+    NormalEquations,
+    ReusableEquations,
+    Step,
+)
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
-_LEAST_STRETCH = 1.15
-"""Steps that should be longer by less than this stay as they are."""
+_LEAST_STRETCH = 0.15
+"""Steps that should be longer or shorter by less than this share stay as they are."""
 REASONS = (
     "still running",
     "converged: the cost no longer falls",
@@ -48,8 +54,23 @@ class LmConfig:
     min_damping: float = 1e-12
     """The damping never falls below this."""
     max_stretch: float = 1.0
-    """Longest that an accepted step may be made, as a multiple, where the model proved too cautious: the weights of
-    robust losses overrate the curvature. 1: never; longer ones cost one more evaluation of the cost."""
+    """Longest that an accepted step may be made, as a multiple, where the model proved wrong about its length: the
+    weights of robust losses overrate the curvature. 1: never; a change costs one more evaluation of the cost."""
+    reuse_below: float = 0.0
+    """Once a step lowers the cost by less than this share, the factorised matrix is kept for the steps that follow:
+    conjugate directions of anew computed gradients, preconditioned by it, at a third of the price. 0: never."""
+
+
+@dataclass(frozen=True)
+class _Course:
+    """A step taken with a matrix that is kept."""
+
+    normal: ReusableEquations
+    newton: Mapping[str, Tensor]
+    """The Newton step there, and the derivative along it."""
+    slope: Float[Tensor, " groups"]
+    direction: Mapping[str, Tensor]
+    """The direction that was taken."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +92,8 @@ class LmState:
     """Index into `REASONS`."""
     normal: NormalEquations | None = field(default=None, repr=False)
     """Normal equations at the values; None where they moved since, or the problem changed."""
+    course: _Course | None = field(default=None, repr=False)
+    """Where the steps follow conjugate directions: the last one."""
     iterations: int = 0
     linearizations: int = 0
 
@@ -107,12 +130,16 @@ def step(
     problem: Problem, state: LmState, config: LmConfig, *, backend: Backend | None = None
 ) -> LmState:
     """The state after one step: each problem that is still running moves, or raises its damping."""
-    normal = state.normal
-    if normal is None:
+    normal, course = state.normal, state.course
+    if course is not None:
+        normal = course.normal.moved(problem, state.values)
+    elif normal is None:
         normal = (backend or DenseBackend()).assemble(problem, state.values)
         state = replace(state, linearizations=state.linearizations + 1)
     running = state.reason == RUNNING
-    proposal = normal.solve(state.damping)
+    proposal = newton = normal.solve(state.damping)
+    if course is not None:
+        proposal = _conjugate(course, normal, newton)
     candidate = retract(problem, state.values, proposal.delta)
     term_cost = term_costs(problem, candidate)
     cost = torch.stack(list(term_cost.values())).sum(0)
@@ -121,7 +148,7 @@ def step(
     accepted = running & proposal.solved & cost.isfinite() & (decrease > 0)
     # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
     stretch = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(accepted, 1.0)
-    if bool((stretch > _LEAST_STRETCH).any()):
+    if config.max_stretch > 1 and bool(((stretch - 1).abs() > _LEAST_STRETCH).any()):
         candidate, term_cost, cost = _stretched(
             problem, state.values, proposal.delta, stretch, (candidate, term_cost, cost)
         )
@@ -142,8 +169,17 @@ def step(
     reason[running & ~accepted & (damping > config.max_damping) & (reason == RUNNING)] = STALLED
 
     moved = bool(accepted.any())
+    if course is not None and not moved:
+        # The kept matrix no longer serves: linearise here, and judge by that.
+        return replace(state, course=None, normal=None, iterations=state.iterations + 1)
+    following = None
+    keeps = bool((decrease <= config.reuse_below * normal.cost).all())
+    if moved and keeps and isinstance(normal, ReusableEquations):
+        slope = normal.slope(newton.delta)
+        following = _Course(normal, newton.delta, slope, proposal.delta)
     return replace(
         state,
+        course=following,
         values=_merge(problem, state.values, candidate, accepted) if moved else state.values,
         damping=damping,
         growth=growth,
@@ -160,6 +196,20 @@ def step(
         normal=None if moved else normal,
         iterations=state.iterations + 1,
     )
+
+
+def _conjugate(course: _Course, normal: NormalEquations, newton: Step) -> Step:
+    """The direction conjugate to that of `course` (Polak and Ribiere, restarted where it would turn back)."""
+    assert isinstance(normal, ReusableEquations)
+    slope = normal.slope(newton.delta)
+    turn = ((slope - normal.slope(course.newton)) / course.slope).clamp_min(0)
+    direction = {
+        name: tangent + turn * course.direction[name] for name, tangent in newton.delta.items()
+    }
+    along = normal.slope(direction)
+    if bool((along > slope / 2).any()):
+        return newton
+    return replace(newton, delta=direction, predicted=-along / 2)
 
 
 def _stretched(
@@ -191,7 +241,7 @@ def _stretched(
 def changed(state: LmState) -> LmState:
     """The state for a problem that changed (matches refreshed, scales narrowed): linearised anew, running again."""
     reason = torch.where(state.reason == NOT_FINITE, state.reason, RUNNING)
-    return replace(state, normal=None, reason=reason)
+    return replace(state, normal=None, course=None, reason=reason)
 
 
 def solve(

@@ -55,6 +55,19 @@ class NormalEquations(Protocol):
 
 
 @runtime_checkable
+class ReusableEquations(NormalEquations, Protocol):
+    """Normal equations whose factorised matrix serves for gradients at other points too."""
+
+    def moved(self, problem: Problem, values: Values) -> ReusableEquations:
+        """Cost and gradient at other values, with the matrix as the last solve factorised it."""
+        ...
+
+    def slope(self, delta: Mapping[str, Tensor]) -> Float[Tensor, " groups"]:
+        """Derivative of the cost along `delta`."""
+        ...
+
+
+@runtime_checkable
 class Backend(Protocol):
     """A way to assemble and solve normal equations."""
 

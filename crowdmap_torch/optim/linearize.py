@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import jacfwd, vmap
 
+from crowdmap_torch.optim.parallel import in_order
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
 
 CHUNK_ROWS = 1 << 14
@@ -68,8 +69,8 @@ def linearize(term: CostTerm, variables: dict[str, Variable], values: Values) ->
 
 
 @dataclass(frozen=True)
-class RowBlocks:
-    """Every row's part of the normal equations, by slot, with the rows as the last axis.
+class RowGradients:
+    """Every row's loss and gradient, by slot, with the rows as the last axis.
 
     Rows last: the blocks are small and the rows many, so that every operation runs along the rows.
     """
@@ -77,6 +78,12 @@ class RowBlocks:
     rho: Float[Tensor, " m"]
     gradient: tuple[Float[Tensor, "k m"], ...]
     """`J_i^T W r` of every slot i."""
+
+
+@dataclass(frozen=True)
+class RowBlocks(RowGradients):
+    """Every row's part of the normal equations."""
+
     hessian: Mapping[tuple[int, int], Float[Tensor, "k l m"]]
     """`J_i^T W J_j` of every two slots i <= j."""
 
@@ -93,6 +100,14 @@ def row_blocks(term: CostTerm, variables: dict[str, Variable], values: Values) -
         linear.robust_weight,
         linear.rho,
     )
+
+
+def row_gradients(term: CostTerm, variables: dict[str, Variable], values: Values) -> RowGradients:
+    """Every row's gradient, by the term's own function or from its blocks."""
+    if term.gradient is None:
+        return row_blocks(term, variables, values)
+    blocks = tuple(values[name][block] for name, block in term.slots)
+    return term.gradient(blocks, term.constants, term.weight, term.loss)
 
 
 def blocks_of_jacobians(
@@ -151,8 +166,13 @@ def term_costs(
     costs = {}
     for name, term in problem.terms.items():
         total = first.new_zeros(problem.group_count)
-        for _, piece in chunks(term, chunk_rows):
-            rho = term.loss.rho(residuals(piece, values).square().sum(-1)) / 2
+        pieces = [piece for _, piece in chunks(term, chunk_rows)]
+        for piece, residual in zip(
+            pieces,
+            in_order(lambda piece: residuals(piece, values), pieces, first.device),
+            strict=True,
+        ):
+            rho = term.loss.rho(residual.square().sum(-1)) / 2
             group = problem.group_of_rows(piece)
             if group is None:
                 total[0] += rho.sum()

@@ -51,6 +51,8 @@ class CostTerm:
     """`residual` of many rows at once [m, d], where that is faster than mapping it over the rows."""
     normal: Callable[..., Any] | None = None
     """`linearize.RowBlocks` of many rows: `(blocks, constants, weight, loss)`; None: from the Jacobians."""
+    gradient: Callable[..., Any] | None = None
+    """`linearize.RowGradients` of many rows, likewise; None: what `normal` gives."""
 
     def __len__(self) -> int:
         return len(self.slots[0][1])

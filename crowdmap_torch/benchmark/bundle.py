@@ -1,0 +1,205 @@
+"""Bundle adjustment against Ceres and GTSAM on one objective: `benchmark.py bundle`.
+
+Every solver runs in a process of its own, in turns; the cost at its result is computed by one neutral function.
+`--problem FILE.npz --out OUT.npz` solves one problem with ours and prints one JSON line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from crowdmap_torch.benchmark import free_corners
+from crowdmap_torch.benchmark.free_corners import FreeCorners
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.chain import ChainBackend
+from crowdmap_torch.optim.problem import Problem, Values
+from crowdmap_torch.optim.robust import Huber, Tukey
+
+LM = lm.LmConfig(
+    max_iterations=100, cost_tolerance=1e-6, initial_damping=1e-8, max_stretch=3.0, reuse_below=5e-3
+)
+"""Both stages stop when a step lowers the cost by less than a millionth, as the peers do."""
+PEERS = {"ceres": "peers/ceres.py", "gtsam": "peers/gtsam.py"}
+SERIES = ((5, 100, 10), (25, 500, 31), (100, 500, 31), (25, 500, 200), (400, 500, 31))
+"""Journeys, frames of each and signs of the problems of the table."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `benchmark.py bundle`."""
+    parser.add_argument("--problem", type=Path, help="solve this problem alone, with ours")
+    parser.add_argument("--out", type=Path, help="npz file of its result: q, p, X")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each; the median counts")
+    parser.add_argument(
+        "--sizes",
+        nargs="+",
+        metavar="JxFxS",
+        default=["x".join(map(str, size)) for size in SERIES],
+        help="journeys x frames x signs",
+    )
+    parser.add_argument("--solvers", nargs="+", default=["ours", *PEERS], choices=["ours", *PEERS])
+
+
+def run(options: argparse.Namespace) -> None:
+    """Solves one problem, or prints the table of all solvers on all sizes."""
+    torch.set_num_threads(options.threads)
+    if options.problem is not None:
+        figures = solve_file(options.problem, options.out, torch.device(options.device))
+        print(json.dumps(figures))
+        return
+    print(f"{'size':>14} {'corners':>9} {'solver':>7} {'setup':>8} {'solve':>8} {'steps':>6} "
+          f"{'memory':>8} {'cost':>16}")  # fmt: skip
+    for size in options.sizes:
+        _race(size, options)
+
+
+def solve_file(problem: Path, out: Path | None, device: torch.device) -> dict[str, Any]:
+    """Solves a problem file; writes q, p and X, and gives times, steps and memory."""
+    given = free_corners.load(problem)
+    if out is not None and not out.parent.is_dir():
+        raise ValueError(f"{out}: the folder {out.parent} does not exist")
+    figures, q, p, X = solve(given, device)
+    if out is not None:
+        beside = out.with_name(f".{out.name}.tmp.npz")
+        np.savez(beside, q=q, p=p, X=X)
+        os.replace(beside, out)
+    return figures
+
+
+def solve(
+    problem: FreeCorners, device: torch.device
+) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:
+    """Huber's stage, then Tukey's from its result; poses eliminated along their chains."""
+    start = time.perf_counter()
+    # What a process loads at its first operations (threads, kernels) is set-up.
+    tiny = free_corners.simulate(3, 12, 2)
+    _minimise(tiny, *_prepared(tiny, device))
+    prepared = _prepared(problem, device)
+    _synchronise(device)
+    ready = time.perf_counter()
+    first, last = _minimise(problem, *prepared)
+    _synchronise(device)
+    done = time.perf_counter()
+    q = se3.to_quaternion(last.values["pose"][:, :3, :3]).cpu().numpy()
+    p, X = last.values["pose"][:, :3, 3].cpu().numpy(), last.values["point"].cpu().numpy()
+    figures = {
+        "setup_s": ready - start,
+        "solve_s": done - ready,
+        "iterations": first.iterations + last.iterations,
+        "peak_gb": _peak_gb(),
+        "cost": free_corners.cost(problem, q, p, X),
+        "reason": last.reasons[0],
+    }
+    if device.type == "cuda":
+        figures["peak_device_gb"] = torch.cuda.max_memory_allocated(device) / 2**30
+    return figures, q, p, X
+
+
+def _prepared(problem: FreeCorners, device: torch.device) -> tuple[Problem, Values, ChainBackend]:
+    """The problem of the first stage, its start, and the back end with the structure worked out."""
+    built, values = free_corners.bundle(problem, Huber(problem.huber_c), device)
+    chain = torch.arange(problem.J, device=device).repeat_interleave(problem.F)
+    backend = ChainBackend("pose", chain)
+    backend.prepare(built, values)
+    return built, values, backend
+
+
+def _minimise(
+    problem: FreeCorners, built: Problem, values: Values, backend: ChainBackend
+) -> tuple[lm.LmState, lm.LmState]:
+    """The states at the end of both stages."""
+    first = lm.solve(built, values, LM, backend=backend)
+    corner = replace(built.terms["corner"], loss=Tukey(problem.tukey_c))
+    built = replace(built, terms={**built.terms, "corner": corner})
+    return first, lm.solve(built, first.values, LM, backend=backend)
+
+
+def _synchronise(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _peak_gb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def _race(size: str, options: argparse.Namespace) -> None:
+    """All solvers on one size, in turns, each in a fresh process; a line of medians for each."""
+    try:
+        journeys, frames, signs = (int(part) for part in size.split("x"))
+    except ValueError:
+        raise ValueError(f"--sizes: expected JOURNEYSxFRAMESxSIGNS, found {size!r}") from None
+    problem = free_corners.simulate(journeys, frames, signs)
+    with tempfile.TemporaryDirectory() as folder:
+        path, out = Path(folder) / "problem.npz", Path(folder) / "result.npz"
+        problem.save(path)
+        runs: dict[str, list[dict[str, Any]]] = {name: [] for name in options.solvers}
+        failed: dict[str, str] = {}
+        for _ in range(options.repeats):
+            for name in options.solvers:
+                if name in failed:
+                    continue
+                try:
+                    figures = _fresh(name, path, out, options)
+                except _Failed as error:
+                    failed[name] = str(error)
+                    continue
+                with np.load(out) as result:
+                    figures["cost"] = free_corners.cost(
+                        problem, result["q"], result["p"], result["X"]
+                    )
+                runs[name].append(figures)
+    for name, done in runs.items():
+        head = f"{size:>14} {len(problem.obs_pt):>9} {name:>7}"
+        if name in failed:
+            print(f"{head} {failed[name]}")
+            continue
+        middle = {
+            key: statistics.median(one[key] for one in done)
+            for key in ("setup_s", "solve_s", "iterations", "peak_gb", "cost")
+        }
+        print(
+            f"{head} {middle['setup_s']:>6.2f} s {middle['solve_s']:>6.2f} s "
+            f"{middle['iterations']:>6.0f} {middle['peak_gb']:>5.2f} GB {middle['cost']:>16.4f}",
+            flush=True,
+        )
+
+
+class _Failed(Exception):
+    """A solver that gave no result, with what it said."""
+
+
+def _fresh(name: str, problem: Path, out: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """The figures that a solver prints in a process of its own."""
+    threads = str(options.threads)
+    if name == "ours":
+        script = Path(sys.argv[0])
+        command = [sys.executable, str(script), "bundle", "--problem", str(problem)]
+        command += ["--out", str(out), "--threads", threads, "--device", options.device]
+    else:
+        command = [sys.executable, str(Path(__file__).parent / PEERS[name])]
+        command += [str(problem), str(out), threads]
+    limits = {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}
+    done = subprocess.run(
+        command, capture_output=True, text=True, env={**os.environ, **limits}, check=False
+    )
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise _Failed(f"exit code {done.returncode}: {said}")
+    return json.loads(done.stdout.strip().splitlines()[-1])

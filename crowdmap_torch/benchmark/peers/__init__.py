@@ -1,0 +1,1 @@
+"""Programs of other solvers, run as files in processes of their own."""
