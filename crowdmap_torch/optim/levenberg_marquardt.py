@@ -25,7 +25,7 @@ from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
-_LEAST_STRETCH = 0.15
+_NEAR_BEST = 0.2
 """Steps that should be longer or shorter by less than this share stay as they are."""
 REASONS = (
     "still running",
@@ -71,6 +71,8 @@ class _Course:
     slope: Float[Tensor, " groups"]
     direction: Mapping[str, Tensor]
     """The direction that was taken."""
+    length: Float[Tensor, " groups"]
+    """And how far along it, as a multiple."""
 
 
 @dataclass(frozen=True)
@@ -140,19 +142,21 @@ def step(
     proposal = newton = normal.solve(state.damping)
     if course is not None:
         proposal = _conjugate(course, normal, newton)
-    candidate = retract(problem, state.values, proposal.delta)
-    term_cost = term_costs(problem, candidate)
-    cost = torch.stack(list(term_cost.values())).sum(0)
+    # Directions along one course want about the same length.
+    length = torch.ones_like(state.damping) if course is None else course.length
+    candidate, term_cost, cost = _trial(problem, state.values, proposal.delta, length)
     decrease = normal.cost - cost
     gain = decrease / proposal.predicted.clamp_min(torch.finfo(cost.dtype).tiny)
     accepted = running & proposal.solved & cost.isfinite() & (decrease > 0)
-    # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
-    stretch = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(accepted, 1.0)
-    if config.max_stretch > 1 and bool(((stretch - 1).abs() > _LEAST_STRETCH).any()):
-        candidate, term_cost, cost = _stretched(
-            problem, state.values, proposal.delta, stretch, (candidate, term_cost, cost)
-        )
-        decrease = normal.cost - cost
+    if config.max_stretch > 1:
+        # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
+        curvature = (2 * length - gain) / length.square()
+        best = (1 / curvature.clamp_min(1 / config.max_stretch)).where(accepted, length)
+        if bool(((best / length - 1).abs() > _NEAR_BEST).any()):
+            other = _trial(problem, state.values, proposal.delta, best)
+            candidate, term_cost, cost = _better(problem, (candidate, term_cost, cost), other)
+            decrease = normal.cost - cost
+        length = best
 
     shrink = (1 - (2 * gain - 1) ** 3).clamp(1 / 3, 2.0)
     damping = torch.where(accepted, state.damping * shrink, state.damping * state.growth)
@@ -176,7 +180,7 @@ def step(
     keeps = bool((decrease <= config.reuse_below * normal.cost).all())
     if moved and keeps and isinstance(normal, ReusableEquations):
         slope = normal.slope(newton.delta)
-        following = _Course(normal, newton.delta, slope, proposal.delta)
+        following = _Course(normal, newton.delta, slope, proposal.delta, length)
     return replace(
         state,
         course=following,
@@ -212,29 +216,32 @@ def _conjugate(course: _Course, normal: NormalEquations, newton: Step) -> Step:
     return replace(newton, delta=direction, predicted=-along / 2)
 
 
-def _stretched(
-    problem: Problem,
-    values: Values,
-    delta: Mapping[str, Tensor],
-    stretch: Float[Tensor, " groups"],
-    plain: tuple[Values, dict[str, Tensor], Tensor],
-) -> tuple[Values, dict[str, Tensor], Tensor]:
-    """Values, costs by term and cost after a longer step, where that is better than the `plain` one."""
-    longer = {}
+_Trial = tuple[dict[str, Tensor], dict[str, Tensor], Tensor]
+"""Values, costs by term, and cost."""
+
+
+def _trial(
+    problem: Problem, values: Values, delta: Mapping[str, Tensor], length: Float[Tensor, " groups"]
+) -> _Trial:
+    """What comes out at a multiple of the step."""
+    scaled = {}
     for name, tangent in delta.items():
         group = problem.variables[name].group
-        longer[name] = tangent * (stretch[0] if group is None else stretch[group][:, None])
-    candidate = retract(problem, values, longer)
+        scaled[name] = tangent * (length[0] if group is None else length[group][:, None])
+    candidate = retract(problem, values, scaled)
     term_cost = term_costs(problem, candidate)
-    cost = torch.stack(list(term_cost.values())).sum(0)
-    old, old_term_cost, old_cost = plain
-    better = cost < old_cost
-    if not bool(better.any()):
-        return plain
+    return candidate, term_cost, torch.stack(list(term_cost.values())).sum(0)
+
+
+def _better(problem: Problem, first: _Trial, second: _Trial) -> _Trial:
+    """The trial with the lower cost, for each of the independent problems."""
+    lower = second[2] < first[2]
+    if not bool(lower.any()):
+        return first
     return (
-        _merge(problem, old, candidate, better),
-        {name: torch.where(better, new, old_term_cost[name]) for name, new in term_cost.items()},
-        torch.where(better, cost, old_cost),
+        _merge(problem, first[0], second[0], lower),
+        {name: torch.where(lower, cost, first[1][name]) for name, cost in second[1].items()},
+        torch.where(lower, second[2], first[2]),
     )
 
 

@@ -15,6 +15,8 @@ from typing import TypeVar
 
 import torch
 
+_WORTH = 4
+"""Items for each thread from which handing them over pays."""
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -25,7 +27,7 @@ def in_order(function: Callable[[T], R], items: Sequence[T], device: torch.devic
     Only a few results are held at a time, so that memory does not grow with their number.
     """
     threads = torch.get_num_threads()
-    if device.type != "cpu" or threads == 1 or len(items) == 1:
+    if device.type != "cpu" or threads == 1 or len(items) < _WORTH * threads:
         yield from map(function, items)
         return
     with _one_core(threads):
