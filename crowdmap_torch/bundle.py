@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from crowdmap_torch import residuals
+from crowdmap_torch import residual_blocks, residuals
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.lane_matching import LaneMatches, follow
 from crowdmap_torch.observations import CornerObservations, LanePointObservations
@@ -45,7 +45,7 @@ class AdjustConfig:
 
     lm: lm.LmConfig = field(
         default_factory=lambda: lm.LmConfig(
-            max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9
+            max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9, max_stretch=3.0
         )
     )
     """The solver; its tolerance counts once the scales stand still."""
@@ -234,6 +234,8 @@ class Bundle(nn.Module):
             rows.template.new_full((len(rows),), 1 / sigma),
             Tukey(self.config.tukey_c),
             residuals.sign_reprojection_jacobian,
+            residual_blocks.sign_reprojection,
+            residual_blocks.sign_reprojection_blocks,
         )
         return {"sign_reprojection": term}
 
@@ -250,6 +252,8 @@ class Bundle(nn.Module):
             valid / sigma,
             Tukey(self.config.tukey_c),
             residuals.lane_reprojection_jacobian,
+            residual_blocks.lane_reprojection,
+            residual_blocks.lane_reprojection_blocks,
         )
         height = CostTerm(
             residuals.lane_height,
@@ -258,6 +262,8 @@ class Bundle(nn.Module):
             valid / rows.height_sigma,
             Tukey(self.config.tukey_c),
             residuals.lane_height_jacobian,
+            residual_blocks.lane_height,
+            residual_blocks.lane_height_blocks,
         )
         return {"lane_reprojection": image, "lane_height": height}
 

@@ -72,6 +72,199 @@ def point_reprojection_gradient(
     return RowGradients(loss.rho(s), (torch.cat((-by_point, by_turn)), by_point))
 
 
+def sign_reprojection(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    T_world_sign: Float[Tensor, "m 4 4"],
+    size: Float[Tensor, "m 2"],
+    template: Float[Tensor, "m 2"],
+    observation: Float[Tensor, "m 3 3"],
+) -> Float[Tensor, "m 2"]:
+    """`residuals.sign_reprojection` of many rows."""
+    (R, p), (R_sign, p_sign) = _planes(T_world_camera), _planes(T_world_sign)
+    corner = (template * size).mT
+    offset = R_sign[:, 0] * corner[0] + R_sign[:, 1] * corner[1] + p_sign - p
+    error, _ = _project(_turn(R, offset), observation.permute(1, 2, 0))
+    return error.mT
+
+
+def sign_reprojection_blocks(
+    blocks: tuple[Float[Tensor, "m 4 4"], Float[Tensor, "m 4 4"], Float[Tensor, "m 2"]],
+    constants: tuple[Float[Tensor, "m 2"], Float[Tensor, "m 3 3"]],
+    weight: Float[Tensor, " m"],
+    loss: Loss,
+) -> RowBlocks:
+    """`residuals.sign_reprojection` by camera pose, sign pose and relative change of size."""
+    (R, p), (R_sign, p_sign) = _planes(blocks[0]), _planes(blocks[1])
+    template, observation = constants
+    corner = (template * blocks[2]).mT
+    along = R_sign[:, 0] * corner[0], R_sign[:, 1] * corner[1]
+    point = _turn(R, along[0] + along[1] + p_sign - p)
+    M = observation.permute(1, 2, 0).contiguous()
+    error, depth = _project(point, M)
+    error = error * weight
+    pose, gradient, rho = _pose_blocks(R, point, error, _by_camera(error, weight, depth, M), loss)
+    # The corner by the sign's turning about its axes, R_sign (w x corner), and by its size; moving it is the identity.
+    x, y = corner
+    normal = R_sign[:, 2]
+    turned = torch.stack((normal * y, -normal * x, R_sign[:, 1] * x - R_sign[:, 0] * y), dim=1)
+    N = torch.cat((turned, torch.stack(along, dim=1)), dim=1)
+    by_point = -pose[:3]
+    crossed = sum_of_products(by_point, N)
+    squared = sum_of_products(N, -crossed[:3])
+    sign = torch.cat(
+        (
+            torch.cat((pose[:3, :3], -crossed[:3, :3]), dim=1),
+            torch.cat((-crossed[:3, :3].transpose(0, 1), squared[:3, :3]), dim=1),
+        )
+    )
+    pulled = -_pulled(N, gradient[:3])
+    return RowBlocks(
+        rho,
+        (gradient, torch.cat((-gradient[:3], pulled[:3])), pulled[3:]),
+        {
+            (0, 0): pose,
+            (0, 1): torch.cat((-pose[:, :3], crossed[:, :3]), dim=1),
+            (0, 2): crossed[:, 3:],
+            (1, 1): sign,
+            (1, 2): torch.cat((-crossed[:3, 3:], squared[:3, 3:])),
+            (2, 2): squared[3:, 3:],
+        },
+    )
+
+
+def lane_reprojection(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    c0: Float[Tensor, "m 3"],
+    c1: Float[Tensor, "m 3"],
+    c2: Float[Tensor, "m 3"],
+    c3: Float[Tensor, "m 3"],
+    weights: Float[Tensor, "m 4"],
+    normal_px: Float[Tensor, "m 2"],
+    observation: Float[Tensor, "m 3 3"],
+) -> Float[Tensor, "m 1"]:
+    """`residuals.lane_reprojection` of many rows."""
+    R, p = _planes(T_world_camera)
+    offset = _spline_point((c0, c1, c2, c3), weights) - p
+    error, _ = _project(_turn(R, offset), observation.permute(1, 2, 0))
+    return (error.mT * normal_px).sum(-1, keepdim=True)
+
+
+def lane_reprojection_blocks(
+    blocks: tuple[Float[Tensor, "m 4 4"], Tensor, Tensor, Tensor, Tensor],
+    constants: tuple[Float[Tensor, "m 4"], Float[Tensor, "m 2"], Float[Tensor, "m 3 3"]],
+    weight: Float[Tensor, " m"],
+    loss: Loss,
+) -> RowBlocks:
+    """`residuals.lane_reprojection` by camera pose and the four coefficients."""
+    weights, normal_px, observation = constants
+    R, p = _planes(blocks[0])
+    point = _turn(R, _spline_point(blocks[1:], weights) - p)
+    M = observation.permute(1, 2, 0).contiguous()
+    error, depth = _project(point, M)
+    normal = normal_px.mT
+    by_camera = _by_camera(error * weight, weight, depth, M)
+    along = ((normal * error).sum(0) * weight)[None]
+    by_camera = (normal[0] * by_camera[0]).addcmul_(normal[1], by_camera[1])[None]
+    return _spline_blocks(_pose_blocks(R, point, along, by_camera, loss), weights)
+
+
+def lane_height(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    c0: Float[Tensor, "m 3"],
+    c1: Float[Tensor, "m 3"],
+    c2: Float[Tensor, "m 3"],
+    c3: Float[Tensor, "m 3"],
+    weights: Float[Tensor, "m 4"],
+    road_normal_camera: Float[Tensor, "m 3"],
+    camera_height: Float[Tensor, " m"],
+) -> Float[Tensor, "m 1"]:
+    """`residuals.lane_height` of many rows."""
+    R, p = _planes(T_world_camera)
+    point = _turn(R, _spline_point((c0, c1, c2, c3), weights) - p)
+    return ((road_normal_camera.mT * point).sum(0) - camera_height)[:, None]
+
+
+def lane_height_blocks(
+    blocks: tuple[Float[Tensor, "m 4 4"], Tensor, Tensor, Tensor, Tensor],
+    constants: tuple[Float[Tensor, "m 4"], Float[Tensor, "m 3"], Float[Tensor, " m"]],
+    weight: Float[Tensor, " m"],
+    loss: Loss,
+) -> RowBlocks:
+    """`residuals.lane_height` by camera pose and the four coefficients."""
+    weights, normal, height = constants
+    R, p = _planes(blocks[0])
+    point = _turn(R, _spline_point(blocks[1:], weights) - p)
+    by_camera = normal.mT * weight
+    error = (by_camera * point).sum(0) - height * weight
+    return _spline_blocks(_pose_blocks(R, point, error[None], by_camera[None], loss), weights)
+
+
+def _spline_point(
+    coefficients: tuple[Tensor, ...], weights: Float[Tensor, "m 4"]
+) -> Float[Tensor, "3 m"]:
+    """The point of a spline that its four coefficients make."""
+    point = coefficients[0].mT * weights[:, 0]
+    for i, coefficient in enumerate(coefficients[1:], 1):
+        point = point + coefficient.mT * weights[:, i]
+    return point
+
+
+def _spline_blocks(
+    of_pose: tuple[Float[Tensor, "6 6 m"], Float[Tensor, "6 m"], Float[Tensor, " m"]],
+    weights: Float[Tensor, "m 4"],
+) -> RowBlocks:
+    """Blocks by pose and spline coefficients: each moves the point by its weight, the camera by minus one."""
+    pose, gradient, rho = of_pose
+    shares = weights.unbind(1)
+    hessian = {(0, 0): pose}
+    for i, share in enumerate(shares):
+        weighted = pose[:, :3] * share
+        hessian[0, i + 1] = -weighted
+        for j in range(i, 4):
+            hessian[i + 1, j + 1] = weighted[:3] * shares[j]
+    by_point = -gradient[:3]
+    return RowBlocks(rho, (gradient, *(by_point * share for share in shares)), hessian)
+
+
+def pose_deviation(
+    T_world_camera: Float[Tensor, "m 4 4"],
+    drift: Float[Tensor, "m 6"],
+    prior: Float[Tensor, "m 4 4"],
+) -> Float[Tensor, "m 6"]:
+    """`residuals.pose_deviation` of many rows."""
+    return pose_prior(T_world_camera, prior) - drift
+
+
+def pose_deviation_blocks(
+    blocks: tuple[Float[Tensor, "m 4 4"], Float[Tensor, "m 6"]],
+    constants: tuple[Float[Tensor, "m 4 4"]],
+    weight: Float[Tensor, "m 6"],
+    loss: Loss,
+) -> RowBlocks:
+    """`residuals.pose_deviation` by pose and drift."""
+    error, w = _deviation(_planes(constants[0]), _planes(blocks[0])), weight.mT
+    B = _right_jacobian_inverse(error[3:])
+    error = error - blocks[1].mT
+    s = (error * w).square().sum(0)
+    square = w.square() * loss.weight(s)
+    pulled = square * error
+    hessian, crossed, own = (error.new_zeros(6, 6, error.shape[1]) for _ in range(3))
+    three, six = torch.arange(3), torch.arange(6)
+    hessian[three, three], crossed[three, three], own[six, six] = square[:3], -square[:3], square
+    weighted = B * square[3:, None]
+    hessian[3:, 3:] = sum_of_products(weighted, B)
+    crossed[3:, 3:] = -weighted.transpose(0, 1)
+    by_pose = torch.cat((pulled[:3], _turn(B, pulled[3:])))
+    return RowBlocks(
+        loss.rho(s), (by_pose, -pulled), {(0, 0): hessian, (0, 1): crossed, (1, 1): own}
+    )
+
+
+def _pulled(N: Float[Tensor, "3 k m"], v: Float[Tensor, "3 m"]) -> Float[Tensor, "k m"]:
+    """`N^T v` of every row."""
+    return sum_of_products(N, v[:, None]).squeeze(1)
+
+
 def _turn(R_a_b: Float[Tensor, "3 3 m"], v_a: Float[Tensor, "3 m"]) -> Float[Tensor, "3 m"]:
     """Vectors of frame a in frame b: `R_a_b^T v_a`."""
     return (R_a_b[0] * v_a[0]).addcmul_(R_a_b[1], v_a[1]).addcmul_(R_a_b[2], v_a[2])

@@ -11,10 +11,17 @@ from crowdmap_torch import residual_blocks, residuals
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.optim.linearize import residuals as whitened
 from crowdmap_torch.optim.linearize import row_blocks, row_gradients
-from crowdmap_torch.optim.problem import CostTerm, Variable, euclidean
+from crowdmap_torch.optim.problem import CostTerm, Variable, euclidean, positive
 from crowdmap_torch.optim.robust import Huber, Quadratic, Tukey
 
-VARIABLES = {"pose": Variable(6, se3.retract), "point": Variable(3, euclidean)}
+VARIABLES = {
+    "pose": Variable(6, se3.retract),
+    "point": Variable(3, euclidean),
+    "sign": Variable(6, se3.retract),
+    "size": Variable(2, positive),
+    "lane": Variable(3, euclidean),
+    "drift": Variable(6, euclidean),
+}
 ROWS = 40
 
 
@@ -27,19 +34,22 @@ def poses(seed):
     return se3.exp(draw(seed, ROWS, 6))
 
 
+def observations():
+    return torch.eye(3, dtype=torch.float64).repeat(ROWS, 1, 1) + draw(3, ROWS, 3, 3, scale=0.02)
+
+
 def corner_term(loss):
     values = {"pose": poses(0), "point": draw(1, ROWS, 3)}
     # Points in front of the cameras, and two behind, where the projection is held.
     ahead = torch.cat((draw(2, ROWS, 2), 4 + draw(2, ROWS, 1).abs()), dim=-1)
     ahead[:2, 2] = -3.0
     values["point"] = se3.transform(values["pose"], ahead)
-    M = torch.eye(3, dtype=torch.float64).repeat(ROWS, 1, 1) + draw(3, ROWS, 3, 3, scale=0.02)
     every = torch.arange(ROWS)
     return (
         CostTerm(
             residuals.point_reprojection,
             (("pose", every), ("point", every)),
-            (M,),
+            (observations(),),
             1 + draw(4, ROWS).abs(),
             loss,
             batched=residual_blocks.point_reprojection,
@@ -89,8 +99,97 @@ def relative_term(loss):
     )
 
 
+def sign_term(loss):
+    values = {"pose": poses(0), "sign": poses(6), "size": 0.5 + draw(7, ROWS, 2).abs()}
+    ahead = torch.cat((draw(2, ROWS, 2), 6 + draw(2, ROWS, 1).abs()), dim=-1)
+    values["sign"][:, :3, 3] = se3.transform(values["pose"], ahead)
+    every = torch.arange(ROWS)
+    return (
+        CostTerm(
+            residuals.sign_reprojection,
+            (("pose", every), ("sign", every), ("size", every)),
+            (draw(8, ROWS, 2), observations()),
+            1 + draw(4, ROWS).abs(),
+            loss,
+            batched=residual_blocks.sign_reprojection,
+            normal=residual_blocks.sign_reprojection_blocks,
+        ),
+        values,
+    )
+
+
+def lane_values():
+    values = {"pose": poses(0)}
+    ahead = torch.cat((draw(2, ROWS, 2), 8 + draw(2, ROWS, 1).abs()), dim=-1)
+    point = se3.transform(values["pose"], ahead)
+    values["lane"] = (point[:, None] + 0.5 * draw(9, ROWS, 4, 3)).flatten(0, 1)
+    first = 4 * torch.arange(ROWS)
+    slots = (("pose", torch.arange(ROWS)), *(("lane", first + i) for i in range(4)))
+    return values, slots, torch.softmax(draw(10, ROWS, 4), dim=-1)
+
+
+def lane_term(loss):
+    values, slots, weights = lane_values()
+    normal = torch.nn.functional.normalize(draw(11, ROWS, 2), dim=-1)
+    return (
+        CostTerm(
+            residuals.lane_reprojection,
+            slots,
+            (weights, normal, observations()),
+            1 + draw(4, ROWS).abs(),
+            loss,
+            batched=residual_blocks.lane_reprojection,
+            normal=residual_blocks.lane_reprojection_blocks,
+        ),
+        values,
+    )
+
+
+def height_term(loss):
+    values, slots, weights = lane_values()
+    return (
+        CostTerm(
+            residuals.lane_height,
+            slots,
+            (weights, draw(12, ROWS, 3), draw(13, ROWS)),
+            1 + draw(4, ROWS).abs(),
+            loss,
+            batched=residual_blocks.lane_height,
+            normal=residual_blocks.lane_height_blocks,
+        ),
+        values,
+    )
+
+
+def deviation_term(loss):
+    term, values = prior_term(loss)
+    values["drift"] = draw(14, ROWS, 6, scale=0.1)
+    every = torch.arange(ROWS)
+    return (
+        replace(
+            term,
+            residual=residuals.pose_deviation,
+            slots=(("pose", every), ("drift", every)),
+            batched=residual_blocks.pose_deviation,
+            normal=residual_blocks.pose_deviation_blocks,
+        ),
+        values,
+    )
+
+
+TERMS = [
+    corner_term,
+    prior_term,
+    relative_term,
+    sign_term,
+    lane_term,
+    height_term,
+    deviation_term,
+]
+
+
 @pytest.mark.parametrize("loss", [Quadratic(), Huber(1.5), Tukey(30.0)])
-@pytest.mark.parametrize("make", [corner_term, prior_term, relative_term])
+@pytest.mark.parametrize("make", TERMS)
 def test_blocks_are_those_of_autograd(make, loss):
     term, values = make(loss)
     ours = row_blocks(term, VARIABLES, values)
@@ -104,7 +203,7 @@ def test_blocks_are_those_of_autograd(make, loss):
 
 
 @pytest.mark.parametrize("loss", [Quadratic(), Tukey(30.0)])
-@pytest.mark.parametrize("make", [corner_term, prior_term, relative_term])
+@pytest.mark.parametrize("make", TERMS)
 def test_gradients_alone_are_those_of_the_blocks(make, loss):
     term, values = make(loss)
     alone = row_gradients(term, VARIABLES, values)
@@ -114,7 +213,7 @@ def test_gradients_alone_are_those_of_the_blocks(make, loss):
         torch.testing.assert_close(mine, other)
 
 
-@pytest.mark.parametrize("make", [corner_term, prior_term, relative_term])
+@pytest.mark.parametrize("make", TERMS)
 def test_residuals_of_many_rows_are_those_of_one(make):
     term, values = make(Quadratic())
     torch.testing.assert_close(
@@ -122,7 +221,7 @@ def test_residuals_of_many_rows_are_those_of_one(make):
     )
 
 
-@pytest.mark.parametrize("make", [corner_term, prior_term, relative_term])
+@pytest.mark.parametrize("make", TERMS)
 def test_chain_rule_jacobians_are_those_of_autograd(make):
     term, values = make(Quadratic())
     jacobian = getattr(residuals, f"{term.residual.__name__}_jacobian")

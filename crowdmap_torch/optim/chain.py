@@ -7,8 +7,9 @@ arithmetic.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -26,7 +27,9 @@ from crowdmap_torch.optim.linearize import (
     rows,
 )
 from crowdmap_torch.optim.parallel import in_order
-from crowdmap_torch.optim.problem import CostTerm, Problem, Values
+from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
+
+_Blocks = TypeVar("_Blocks", bound=RowGradients)
 
 
 @dataclass
@@ -365,7 +368,7 @@ def _assemble(
             couplings[name] = blocks.new_zeros(len(coupling.block), coupling.column.shape[1], k)
             term = term if coupling.order is None else rows(term, coupling.order)
         pieces = list(chunks(term, chunk_rows))
-        parts = in_order(lambda piece: row_blocks(piece[1], kinds, values), pieces, blocks.device)
+        parts = _computed(row_blocks, term, [piece for _, piece in pieces], kinds, values)
         for (at, piece), part in zip(pieces, parts, strict=True):
             cost += part.rho.sum() / 2
             sums.add_gradient(piece, part)
@@ -389,6 +392,21 @@ def _assemble(
         sums.gradient(),
         workspace,
     )
+
+
+def _computed(
+    function: Callable[[CostTerm, dict[str, Variable], Values], _Blocks],
+    term: CostTerm,
+    pieces: list[CostTerm],
+    kinds: dict[str, Variable],
+    values: Values,
+) -> Iterator[_Blocks]:
+    """`function` of every piece of a term, in order, on all cores where the term brings its own blocks."""
+    device = term.slots[0][1].device
+    if term.normal is None:
+        # Forward-mode autograd is of one thread at a time.
+        return map(lambda piece: function(piece, kinds, values), pieces)
+    return in_order(lambda piece: function(piece, kinds, values), pieces, device)
 
 
 def _add_mixed(mixed: Tensor, coupling: Coupling, at: slice, part: RowBlocks) -> None:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from crowdmap_torch import residuals
+from crowdmap_torch import residual_blocks, residuals
 from crowdmap_torch.bundle import AdjustConfig, Bundle, DriftNodes, PosePriorConfig
 from crowdmap_torch.geometry import plane, se3, spline_basis
 from crowdmap_torch.lane_matching import LaneMatches, nearest_lanes
@@ -218,6 +218,8 @@ def _pose_terms(
         (prior,),
         1 / white[nodes.journey[nodes.of_frame]],
         jacobian=residuals.pose_deviation_jacobian,
+        batched=residual_blocks.pose_deviation,
+        normal=residual_blocks.pose_deviation_blocks,
     )
     follows = torch.nonzero(nodes.journey[1:] == nodes.journey[:-1])[:, 0]
     gap = (nodes.way[follows + 1] - nodes.way[follows]).clamp_min(0.1)[:, None]
