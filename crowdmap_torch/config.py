@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import yaml
 
 from crowdmap_torch.bundle import AdjustConfig
+from crowdmap_torch.control import ControlConfig
 from crowdmap_torch.crowd import CrowdConfig
 from crowdmap_torch.stages.associate import SignAssociationConfig
 from crowdmap_torch.stages.associate_lanes import LaneAssociationConfig
@@ -55,6 +56,8 @@ class MapperConfig:
     """V-A.2, with `method: paper2017`."""
     adjust: AdjustConfig = field(default_factory=AdjustConfig)
     """V-B: bundle adjustment."""
+    control: ControlConfig = field(default_factory=ControlConfig)
+    """Surveyed signs that pin the map: which of the map's they are."""
     seed: int = 0
     """Of k-means; the same seed and data give the same map."""
     min_confidence: float = 0.5

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from crowdmap_torch.bundle import Bundle
 from crowdmap_torch.config import MapperConfig, config_hash
+from crowdmap_torch.control import find_control_points
 from crowdmap_torch.crowd import Crowd, associate_crowd, unbiased_signs
 from crowdmap_torch.crowd_signs import gather_signs
 from crowdmap_torch.geometry import polygon, se3
@@ -52,6 +53,7 @@ from crowdmap_torch.tables import (
     Lanes,
     RoadEstimate,
     Signs,
+    SurveySigns,
     Tracklets,
     concatenate,
     concatenate_lanes,
@@ -107,6 +109,8 @@ class MapResult:
     poses: tuple[Float[Tensor, "f 4 4"], ...]
     """Refined camera poses."""
     state: LmState
+    control_points: int = 0
+    """Surveyed signs that pin the map."""
 
 
 def build_map(
@@ -115,12 +119,16 @@ def build_map(
     *,
     workers: int = 1,
     progress: ProgressCall = silent,
+    control: SurveySigns | None = None,
 ) -> MapResult:
-    """The map of all journeys; `progress` is told the stage, how much is done and of how much."""
+    """The map of all journeys; `progress` is told the stage, how much is done and of how much.
+
+    Signs that are in `control` pin the map.
+    """
     journeys = dataset.journeys
     maps = map_journeys(journeys, config, workers=workers, progress=progress)
     first = first_map(journeys, maps, config)
-    bundle = build_bundle(journeys, maps, first, config)
+    bundle = build_bundle(journeys, maps, first, config, control=control)
     state = adjust.start(bundle)
     backend = bundle.backend()
     most = config.adjust.lm.max_iterations
@@ -236,8 +244,10 @@ def build_bundle(
     maps: Sequence[JourneyMap],
     first: FirstMap,
     config: MapperConfig,
+    *,
+    control: SurveySigns | None = None,
 ) -> Bundle:
-    """Section V-B: the unknowns and observations of bundle adjustment."""
+    """Section V-B: the unknowns and observations of bundle adjustment; signs that are in `control` pin the map."""
     return adjust.build(
         journeys,
         [m.road for m in maps],
@@ -247,6 +257,9 @@ def build_bundle(
         first.drifts,
         config.adjust,
         left_out=[suspect.journey for suspect in first.crowd.report.suspects],
+        control=None
+        if control is None
+        else find_control_points(first.signs, control, config.control),
     )
 
 
@@ -281,7 +294,8 @@ def finish_map(
     provenance = {"config": config_hash(config), "journeys": [j.journey_id for j in journeys]}
     hd_map = as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
     clusters = clusters_map(dataset, replace(first, associations=associations), provenance)
-    return MapResult(hd_map, clusters, tuple(maps), first, associations, poses, state)
+    known = len(bundle.fixed["control"]) if "control" in bundle.fixed else 0
+    return MapResult(hd_map, clusters, tuple(maps), first, associations, poses, state, known)
 
 
 def clusters_map(dataset: Dataset, first: FirstMap, provenance: dict | None = None) -> HdMap:

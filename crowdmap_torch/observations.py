@@ -68,6 +68,17 @@ def station(T_world_camera: Float[Tensor, "f 4 4"], *, half_window: int = 7) -> 
     return torch.cat((speed.new_zeros(1), ((speed[1:] + speed[:-1]) / 2).cumsum(0)))[: last + 1]
 
 
+@dataclass(frozen=True)
+class ControlPoints(Rows):
+    """Signs of the map whose centre was surveyed."""
+
+    sign: Int[Tensor, " n"]
+    """Row of the map's sign."""
+    center_world: Float[Tensor, "n 3"]
+    sigma: Float[Tensor, " n"]
+    """1-sigma of the centre per axis [m]."""
+
+
 def corner_observations(
     journeys: Sequence[Journey], associations: Sequence[Association], signs: Signs
 ) -> CornerObservations:

@@ -57,6 +57,17 @@ def sign_reprojection(
     return pixel_error(se3.transform(se3.inverse(T_world_camera), corner_world), observation)
 
 
+def sign_place(
+    T_world_sign: Float[Tensor, "4 4"],
+    size: Float[Tensor, " 2"],
+    template: Float[Tensor, " 2"],
+    surveyed: Float[Tensor, " 3"],
+) -> Float[Tensor, " 3"]:
+    """Displacement of a point of a sign's plane from where a survey puts it [m]."""
+    point_sign = torch.cat((template * size, torch.zeros_like(size[:1])))
+    return se3.transform(T_world_sign, point_sign) - surveyed
+
+
 def lane_reprojection(
     T_world_camera: Float[Tensor, "4 4"],
     c0: Float[Tensor, " 3"],

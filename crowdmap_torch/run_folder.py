@@ -10,7 +10,12 @@ from pathlib import Path
 
 from crowdmap_torch import __version__
 from crowdmap_torch.config import MapperConfig, dump
-from crowdmap_torch.evaluate import MapFigures, evaluate_map, refuse_other_origin
+from crowdmap_torch.evaluate import (
+    MapFigures,
+    control_ids_of,
+    evaluate_map,
+    refuse_other_origin,
+)
 from crowdmap_torch.evaluation.evidence import read_journey_landmarks
 from crowdmap_torch.io.atomic import atomic_file, atomic_folder
 from crowdmap_torch.io.landmarks import write_lanes, write_signs
@@ -98,8 +103,11 @@ class RunFolder:
 def read_survey_of(dataset_folder: Path, origin: Origin) -> Survey | None:
     """The dataset's survey, or None if it has none; ValueError if it cannot be read or has another origin."""
     folder = dataset_folder / "survey"
-    if not folder.exists():
-        return None
+    return read_survey_at(folder, origin) if folder.exists() else None
+
+
+def read_survey_at(folder: Path, origin: Origin) -> Survey:
+    """The survey in a folder; ValueError if it cannot be read or has another origin than `origin`."""
     survey = read_survey(folder)
     refuse_other_origin(origin, survey.origin)
     return survey
@@ -114,14 +122,22 @@ def read_truth_of(dataset_folder: Path, dataset: Dataset, survey: Survey | None)
 
 
 def figures_of(
-    hd_map: HdMap, survey: Survey, truth: Truth | None, run: RunFolder | None
+    hd_map: HdMap,
+    survey: Survey,
+    truth: Truth | None,
+    run: RunFolder | None,
+    control: Survey | None = None,
 ) -> MapFigures:
-    """METRICS.md's figures of a map; with a run's folder those of associations and single journeys too."""
+    """METRICS.md's figures of a map; with a run's folder those of associations and single journeys too.
+
+    Signs that were `control` points are left out.
+    """
+    known = () if control is None else control_ids_of(control, survey)
     if truth is None:
         note = "no truth with the survey: every surveyed sign is observable"
-        return evaluate_map(hd_map, survey, notes=(note,))
+        return evaluate_map(hd_map, survey, control_ids=known, notes=(note,))
     if run is None:
-        return evaluate_map(hd_map, survey, truth=truth)
+        return evaluate_map(hd_map, survey, truth=truth, control_ids=known)
     ids = [t.journey.journey_id for t in truth.journeys]
     return evaluate_map(
         hd_map,
@@ -129,4 +145,5 @@ def figures_of(
         truth=truth,
         associations=read_associations(run.path / "associations.parquet", ids),
         landmarks=read_journey_landmarks(run.path, ids),
+        control_ids=known,
     )

@@ -45,6 +45,7 @@ def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict
         else 0,
         "sign detections used": sum(int((a.sign >= 0).sum()) for a in result.associations),
         "lane detections used": sum(int((a.lane >= 0).sum()) for a in result.associations),
+        "control points": result.control_points,
         "signs of the map": int((signs.confidence >= config.min_confidence).sum()),
         "tentative signs": int((signs.confidence < config.min_confidence).sum()),
         "lanes of the map": len(result.hd_map.lanes),

@@ -23,7 +23,13 @@ from crowdmap_torch.report.html import write_report
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.report.watch import Watch
-from crowdmap_torch.run_folder import RunFolder, figures_of, read_survey_of, read_truth_of
+from crowdmap_torch.run_folder import (
+    RunFolder,
+    figures_of,
+    read_survey_at,
+    read_survey_of,
+    read_truth_of,
+)
 from crowdmap_torch.run_metrics import metrics_of, record_of
 from crowdmap_torch.stages import adjust
 
@@ -38,6 +44,9 @@ def main(arguments: list[str] | None = None) -> int:
         dataset = load_dataset(options.dataset, device=device, strict=options.strict)
         survey = read_survey_of(options.dataset, dataset.origin)
         truth = read_truth_of(options.dataset, dataset, survey)
+        control = None
+        if options.control is not None:
+            control = read_survey_at(options.control, dataset.origin)
     except ValueError as error:
         print(f"optimize.py: {error}", file=sys.stderr)
         return 2
@@ -59,7 +68,8 @@ def main(arguments: list[str] | None = None) -> int:
 
         # ---- everything at once (section V-B) ----
         progress("bundle adjustment: building")
-        bundle = mapper.build_bundle(journeys, maps, first, config)
+        known = None if control is None else control.signs.to(device)
+        bundle = mapper.build_bundle(journeys, maps, first, config, control=known)
         start = 0
         if options.resume and run.checkpoint.exists():
             try:
@@ -97,8 +107,8 @@ def main(arguments: list[str] | None = None) -> int:
             mapper.certain_part(m, config.min_confidence)
             for m in (result.hd_map, result.map_clusters)
         )
-        figures = figures_of(final, survey, truth, run)
-        figures_before = figures_of(before, survey, truth, None)
+        figures = figures_of(final, survey, truth, run, control)
+        figures_before = figures_of(before, survey, truth, None, control)
         print(format_figures(figures))
     progress.finish()
     seconds, compared = progress.seconds, (figures, figures_before)
@@ -124,6 +134,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="a folder as in FORMAT.md")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder to write")
     parser.add_argument("--config", type=Path, metavar="YAML", help="what differs from defaults")
+    parser.add_argument(
+        "--control", type=Path, metavar="MAP", help="surveyed signs that pin the map, as a survey"
+    )
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
     parser.add_argument(
         "--workers",

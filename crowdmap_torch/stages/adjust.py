@@ -18,9 +18,10 @@ from torch import Tensor
 
 from crowdmap_torch import residual_blocks, residuals
 from crowdmap_torch.bundle import AdjustConfig, Bundle, DriftNodes, PosePriorConfig
-from crowdmap_torch.geometry import plane, se3, spline_basis
+from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.lane_matching import LaneMatches, nearest_lanes
 from crowdmap_torch.observations import (
+    ControlPoints,
     LanePointObservations,
     corner_observations,
     frame_offsets,
@@ -43,11 +44,12 @@ def build(
     config: AdjustConfig,
     *,
     left_out: Collection[int] = (),
+    control: ControlPoints | None = None,
 ) -> Bundle:
     """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
 
     `drifts` are tangents per frame, from the positioning module's pose to the start pose. Journeys `left_out`, by
-    number, have no say.
+    number, have no say. Signs that are `control` points are held where they were surveyed.
     """
     offsets = frame_offsets(journeys)
     prior = torch.cat([journey.T_world_camera for journey in journeys])
@@ -98,6 +100,8 @@ def build(
     }
     fixed = _pose_terms(journeys, prior[frame], nodes, config)
     fixed.update(_lane_prior(values["lane"], lanes, config))
+    if control is not None and len(control):
+        fixed["control"] = _control_term(control, signs)
     tree = KDTree(values["pose"][:, :3, 3].cpu().numpy()) if len(frame) else None
     beside = torch.zeros(0, dtype=torch.long, device=frame.device)
     if tree is not None:
@@ -259,6 +263,19 @@ def _drift_model(
         length = config.drift_length_m * (total / drift).square()
         lengths.append(torch.cat((length, prior.new_tensor([config.rotation_length_m] * 3))))
     return torch.stack(sigmas), torch.stack(lengths)
+
+
+def _control_term(control: ControlPoints, signs: Signs) -> CostTerm:
+    """Surveyed centres of signs; a sign's centre is the mean of its corners."""
+    shape = signs.shape[control.sign]
+    mask = polygon.corner_mask(shape)[..., None].to(control.center_world)
+    template = (polygon.template(shape).to(mask) * mask).sum(1) / mask.sum(1)
+    return CostTerm(
+        residuals.sign_place,
+        (("sign", control.sign), ("size", control.sign)),
+        (template, control.center_world),
+        1 / control.sigma,
+    )
 
 
 def _lane_prior(

@@ -394,3 +394,23 @@ def test_journeys_without_detections_give_a_map_without_rows(optimize, copy: Pat
         pq.read_table(d / "journeys" / "journey-000" / "poses.parquet") for d in (copy, out)
     )
     assert np.allclose(given["x"].to_numpy(), refined["x"].to_numpy())
+
+
+def test_control_points_pin_the_map_and_are_left_out_of_its_figures(
+    optimize, quick, copy: Path, tmp_path: Path
+):
+    said = optimize(copy, tmp_path / "run", "--control", str(copy / "survey"))
+    assert said.code == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["counts"]["control points"] > 0
+    assert metrics["survey"]["control_signs"] >= metrics["counts"]["control points"]
+    assert metrics["survey"]["signs"]["matched_observable"] == 0
+
+
+def test_control_points_of_another_place_are_one_line(optimize, copy: Path, tmp_path: Path):
+    control = Path(shutil.copytree(copy / "survey", tmp_path / "control"))
+    head = json.loads((control / "map.json").read_text())
+    head["origin"]["lat_deg"] += 0.001
+    (control / "map.json").write_text(json.dumps(head))
+    said = optimize(copy, tmp_path / "run", "--control", str(control))
+    assert_refused(said, tmp_path / "run", "expected one origin")
