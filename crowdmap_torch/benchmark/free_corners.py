@@ -123,7 +123,7 @@ def simulate(journeys: int, frames: int, signs: int, seed: int = 0) -> FreeCorne
     for sign in range(signs):
         near = np.nonzero(np.abs(where[sign] - frame_station - 34) < 26)[0]
         local = point[4 * sign : 4 * sign + 4][None] - p[near, None]
-        local = np.einsum("nji,ncj->nci", R[near].as_matrix(), local)
+        local = np.einsum("nji,ncj->nci", _rows(R, near).as_matrix(), local)
         px = local[..., :2] / local[..., 2:] * K[:2] + K[2:]
         inside = (local[..., 2] > 1) & (px > 0).all(-1) & (px < 2 * K[2:]).all(-1)
         near = near[inside.all(1)]
@@ -145,8 +145,8 @@ def simulate(journeys: int, frames: int, signs: int, seed: int = 0) -> FreeCorne
     error = (bias + drift * [0.2, 0.2, 0.1]).reshape(n, 3)
     sig_r, odo_r = np.radians(0.3), np.radians(0.02)
     first = (np.arange(journeys)[:, None] * frames + np.arange(frames - 1)).ravel()
-    step = R[first].inv().apply(p[first + 1] - p[first])
-    turn = R[first].inv() * R[first + 1] * _turns(rng, odo_r, len(first))
+    step = _rows(R, first).inv().apply(p[first + 1] - p[first])
+    turn = _rows(R, first).inv() * _rows(R, first + 1) * _turns(rng, odo_r, len(first))
     return FreeCorners(
         J=journeys,
         F=frames,
@@ -175,9 +175,13 @@ def _turns(rng: np.random.Generator, sigma: float, n: int) -> Rotation:
     return Rotation.from_rotvec(sigma * rng.standard_normal((n, 3)))
 
 
+def _rows(R: Rotation, rows: Array) -> Rotation:
+    return Rotation.from_quat(R.as_quat()[rows])
+
+
 def _project(K: Array, q: Array, p: Array, X: Array, pose: Array, point: Array) -> Array:
     # Rotation by the transpose of R: the world offset in camera axes.
-    local = Rotation.from_quat(q)[pose].inv().apply(X[point] - p[pose])
+    local = Rotation.from_quat(q[pose]).inv().apply(X[point] - p[pose])
     return local[:, :2] / local[:, 2:] * K[:2] + K[2:]
 
 
@@ -191,8 +195,8 @@ def cost(problem: FreeCorners, q: Array, p: Array, X: Array) -> float:
     total += ((p - problem.prior_p) ** 2).sum() / problem.sig_prior_t**2
     total += ((prior.inv() * R).magnitude() ** 2).sum() / problem.sig_prior_r**2
     k = problem.odo_i
-    step = R[k].inv().apply(p[k + 1] - p[k]) - problem.odo_p
-    turn = Rotation.from_quat(problem.odo_q).inv() * R[k].inv() * R[k + 1]
+    step = _rows(R, k).inv().apply(p[k + 1] - p[k]) - problem.odo_p
+    turn = Rotation.from_quat(problem.odo_q).inv() * _rows(R, k).inv() * _rows(R, k + 1)
     total += (step**2).sum() / problem.sig_odo_t**2
     total += (turn.magnitude() ** 2).sum() / problem.sig_odo_r**2
     return float(total / 2)

@@ -151,3 +151,23 @@ def test_autograd_jacobians_go_through_the_retraction():
     torch.testing.assert_close(by_tangent, by_value * true.abs()[block][:, None])
     linear = linearize(problem.terms["decay"], kinds, {"x": true.abs()})
     torch.testing.assert_close(linear.jacobians[0], 100 * by_tangent)
+
+
+def test_longer_steps_reach_the_same_minimum_in_fewer_steps():
+    # A robust loss far out: its weights overrate the curvature, and plain steps are too short.
+    x = torch.linspace(-3, 3, 41, dtype=torch.float64)
+    target = 0.4 * x + 1.0
+    target[::5] += 4.0
+
+    def residual(line, at, value):
+        return (line[0] * at + line[1] - value)[None]
+
+    index = torch.zeros(len(x), dtype=torch.long)
+    term = CostTerm(residual, (("line", index),), (x, target), None, Tukey(6.0))
+    problem = Problem({"line": Variable(2, euclidean)}, {"fit": term})
+    start = {"line": torch.tensor([[-0.3, 2.5]], dtype=torch.float64)}
+    plain = lm.LmConfig(cost_tolerance=1e-10, initial_damping=1e-8)
+    states = [lm.solve(problem, start, replace(plain, max_stretch=most)) for most in (1.0, 3.0)]
+    assert all(state.done for state in states)
+    torch.testing.assert_close(states[1].cost, states[0].cost, rtol=1e-6, atol=0)
+    assert states[1].iterations < states[0].iterations
