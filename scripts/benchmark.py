@@ -14,6 +14,7 @@ BENCHMARKS = {
     "bundle": "bundle adjustment, ours against Ceres and GTSAM",
     "cluster": "clustering at scale, ours against scikit-learn",
     "journey": "one drive: throughput and latency of a step",
+    "ladybug": "bundle adjustment in the large, ours against Ceres",
 }
 
 

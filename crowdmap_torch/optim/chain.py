@@ -147,7 +147,7 @@ class ChainNormalEquations:
         for name, term in problem.terms.items():
             cost = torch.zeros_like(self.cost)
             pieces = [piece for _, piece in chunks(term)]
-            parts = in_order(lambda piece: row_gradients(piece, kinds, values), pieces, cost.device)
+            parts = _computed(row_gradients, term, pieces, kinds, values)
             for piece, part in zip(pieces, parts, strict=True):
                 cost += part.rho.sum() / 2
                 sums.add_gradient(piece, part)
@@ -316,7 +316,7 @@ class _Part:
     inverse: Float[Tensor, "e k k"]
     towards: Float[Tensor, "e k sk"]
     """Minus the inverse diagonals times the links to the neighbours."""
-    square: Float[Tensor, "sk sk"]
+    square: Float[Tensor, "e sk sk"]
     """To be added to the neighbours' diagonals and to the link between them."""
     at: Int[Tensor, " ww"]
     product: Float[Tensor, " ww"]
@@ -329,8 +329,9 @@ def _eliminate(batch: Batch, diagonal: Tensor, link: Tensor, store: Tensor, stri
     """What a batch leaves behind; its own rows are solved in place."""
     groups, size, w, sides = batch.fill.shape
     k = store.shape[-1]
-    # A block that is not positive definite gives what is not finite, and the whole step fails.
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(diagonal[batch.place]).L)
+    factor, failed = torch.linalg.cholesky_ex(diagonal[batch.place])
+    # A block that is not positive definite spoils all that follows, and the whole step fails.
+    inverse = torch.cholesky_inverse(factor).where((failed == 0)[:, None, None], torch.nan)
     links = link[batch.place]
     if sides == 2:
         links = torch.cat((link[batch.neighbour[:, 0]].mT, links), dim=-1)

@@ -210,3 +210,36 @@ def test_links_between_distant_blocks_are_refused():
         ChainBackend("pose", chain).assemble(
             Problem(built.variables, {**built.terms, "far": far}), values
         )
+
+
+def test_a_chain_that_is_not_positive_definite_gives_a_failed_step_and_no_covariance():
+    built, values, chain = problem([12, 7])
+    normal = ChainBackend("pose", chain).assemble(built, values)
+    spoilt = normal.diagonal.clone()
+    spoilt[5] = -spoilt[5]
+    spoilt_normal = replace(normal, diagonal=spoilt)
+    step = spoilt_normal.solve(torch.tensor([1e-6], dtype=torch.float64))
+    assert not bool(step.solved)
+    with pytest.raises(ValueError, match="not positive definite"):
+        spoilt_normal.marginal_covariance()
+
+
+def test_kept_factors_give_the_step_of_another_gradient():
+    built, values, chain = problem([30, 20], seed=5)
+    damping = torch.tensor([0.0], dtype=torch.float64)
+    normal = ChainBackend("pose", chain).assemble(built, values)
+    first = normal.solve(damping)
+    elsewhere = {name: value + 1e-3 * first.delta[name] for name, value in values.items()}
+    step = normal.moved(built, elsewhere).solve(damping)
+    dense = DenseBackend().assemble(built, elsewhere)
+    here = DenseBackend().assemble(built, values)
+    expected = -torch.linalg.solve(here.hessian[0], dense.gradient[0])
+    n = len(chain)
+    torch.testing.assert_close(
+        step.delta["pose"].flatten(), expected[: 3 * n], rtol=1e-7, atol=1e-9
+    )
+    torch.testing.assert_close(
+        step.delta["mark"].flatten(), expected[3 * n :], rtol=1e-7, atol=1e-9
+    )
+    slope = normal.moved(built, elsewhere).slope(step.delta)
+    torch.testing.assert_close(slope[0], dense.gradient[0] @ expected)
