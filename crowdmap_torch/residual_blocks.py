@@ -356,6 +356,38 @@ def pose_prior_blocks(
     return RowBlocks(loss.rho(s), (gradient,), {(0, 0): hessian})
 
 
+def pose_prior_gradient(
+    blocks: tuple[Float[Tensor, "m 4 4"]],
+    constants: tuple[Float[Tensor, "m 4 4"]],
+    weight: Float[Tensor, "m 6"],
+    loss: Loss,
+) -> RowGradients:
+    """The gradient alone of `pose_prior_blocks`."""
+    error, w = _deviation(_planes(constants[0]), _planes(blocks[0])), weight.mT
+    s = (error * w).square().sum(0)
+    pulled = error * w.square() * loss.weight(s)
+    gradient = torch.cat((pulled[:3], _pulled_back(error[3:], pulled[3:])))
+    return RowGradients(loss.rho(s), (gradient,))
+
+
+def relative_pose_gradient(
+    blocks: tuple[Float[Tensor, "m 4 4"], Float[Tensor, "m 4 4"]],
+    constants: tuple[Float[Tensor, "m 4 4"]],
+    weight: Float[Tensor, "m 6"],
+    loss: Loss,
+) -> RowGradients:
+    """The gradient alone of `relative_pose_blocks`."""
+    R_from, _ = T_from = _planes(blocks[0])
+    R_from_to, step = moved = _step(T_from, _planes(blocks[1]))
+    error, w = _deviation(_planes(constants[0]), moved), weight.mT
+    s = (error * w).square().sum(0)
+    pulled = error * w.square() * loss.weight(s)
+    force = _turn(R_from.transpose(0, 1), pulled[:3])
+    turn = _pulled_back(error[3:], pulled[3:])
+    turn_from = torch.linalg.cross(pulled[:3], step, dim=0) - _turn(R_from_to.transpose(0, 1), turn)
+    return RowGradients(loss.rho(s), (torch.cat((-force, turn_from)), torch.cat((force, turn))))
+
+
 def relative_pose_blocks(
     blocks: tuple[Float[Tensor, "m 4 4"], Float[Tensor, "m 4 4"]],
     constants: tuple[Float[Tensor, "m 4 4"]],
@@ -441,9 +473,15 @@ def _log(R: Float[Tensor, "3 3 m"]) -> Float[Tensor, "3 m"]:
     )
 
 
-def _right_jacobian_inverse(w: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
-    """`residuals.right_jacobian_inverse`, rows last."""
-    theta_sq = w.square().sum(0)
+def _pulled_back(w: Float[Tensor, "3 m"], v: Float[Tensor, "3 m"]) -> Float[Tensor, "3 m"]:
+    """The transposed inverse right Jacobian at `w` times `v`, without the matrix."""
+    factor = _curvature(w.square().sum(0))
+    across = torch.linalg.cross(w, v, dim=0)
+    return v - across / 2 + torch.linalg.cross(w, across, dim=0) * factor
+
+
+def _curvature(theta_sq: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
+    """Factor of the squared term in the inverse right Jacobian, by the squared angle."""
     # Bernoulli numbers' series: the next term is below 1e-13 up to a tenth of a radian.
     factor = 1 / 12 + theta_sq * (1 / 720 + theta_sq * (1 / 30240 + theta_sq / 1209600))
     small = theta_sq < 0.01
@@ -451,6 +489,13 @@ def _right_jacobian_inverse(w: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
         theta = torch.where(small, 1.0, theta_sq).sqrt()
         closed = (1 - theta * (1 + theta.cos()) / (2 * theta.sin())) / theta.square()
         factor = torch.where(small, factor, closed)
+    return factor
+
+
+def _right_jacobian_inverse(w: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
+    """`residuals.right_jacobian_inverse`, rows last."""
+    theta_sq = w.square().sum(0)
+    factor = _curvature(theta_sq)
     # W W = w w^T - |w|^2 I.
     J = _skew(w / 2) + w[:, None] * w * factor
     J[(0, 1, 2), (0, 1, 2)] += 1 - theta_sq * factor

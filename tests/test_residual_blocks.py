@@ -75,6 +75,7 @@ def prior_term(loss):
             loss,
             batched=residual_blocks.pose_prior,
             normal=residual_blocks.pose_prior_blocks,
+            gradient=residual_blocks.pose_prior_gradient,
         ),
         values,
     )
@@ -94,6 +95,7 @@ def relative_term(loss):
             loss,
             batched=residual_blocks.relative_pose,
             normal=residual_blocks.relative_pose_blocks,
+            gradient=residual_blocks.relative_pose_gradient,
         ),
         values,
     )
@@ -169,6 +171,7 @@ def deviation_term(loss):
         replace(
             term,
             residual=residuals.pose_deviation,
+            gradient=None,
             slots=(("pose", every), ("drift", every)),
             batched=residual_blocks.pose_deviation,
             normal=residual_blocks.pose_deviation_blocks,

@@ -243,6 +243,7 @@ def bundle(
             jacobian=residuals.pose_prior_jacobian,
             batched=residual_blocks.pose_prior,
             normal=residual_blocks.pose_prior_blocks,
+            gradient=residual_blocks.pose_prior_gradient,
         ),
         "odometry": CostTerm(
             residuals.relative_pose,
@@ -252,6 +253,7 @@ def bundle(
             jacobian=residuals.relative_pose_jacobian,
             batched=residual_blocks.relative_pose,
             normal=residual_blocks.relative_pose_blocks,
+            gradient=residual_blocks.relative_pose_gradient,
         ),
     }
     variables = {"pose": Variable(6, se3.retract), "point": Variable(3, euclidean)}

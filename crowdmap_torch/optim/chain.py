@@ -113,9 +113,9 @@ class _Workspace:
 class _Factor:
     """The factorised matrix, together with the boundary store."""
 
-    inverses: list[Float[Tensor, "e k k"]]
+    inverses: list[Float[Tensor, "_ k k"]]
     """By batch: inverse diagonals."""
-    towards: list[Float[Tensor, "e k sk"]]
+    towards: list[Float[Tensor, "_ k _"]]
     """By batch: minus the inverse diagonals times the links to the neighbours."""
     reduced: Float[Tensor, "r r"]
     """Cholesky factor of the reduced system."""
@@ -192,14 +192,21 @@ class ChainNormalEquations:
         gradient = self.gradient.new_zeros(len(structure.order), self.chain_gradient.shape[1])
         gradient[structure.place] = self.chain_gradient
         right_side = torch.nn.functional.pad(self.gradient, (0, 2))
-        batches = [batch for level in structure.levels for batch in level.batches]
-        for batch, leads in zip(batches, factor.towards, strict=True):
+
+        def pass_on(item: tuple[Batch, Tensor]) -> tuple[Tensor, Tensor]:
+            batch, leads = item
             groups, size, w, _ = batch.fill.shape
             own = gradient[batch.place][..., None]
             seen = (_rows(batch, self.workspace.store) @ own).view(groups, size, w).sum(1)
-            right_side.index_add_(0, batch.columns.flatten(), -seen.flatten())
-            passed = (leads.mT @ own).view(-1, own.shape[1])
-            gradient.index_add_(0, batch.neighbour.flatten(), passed)
+            return seen.neg_().flatten(), (leads.mT @ own).view(-1, own.shape[1])
+
+        towards = iter(factor.towards)
+        for level in structure.levels:
+            items = [(batch, next(towards)) for batch in level.batches]
+            passed = in_order(pass_on, items, gradient.device)
+            for batch, (seen, across) in zip(level.batches, passed, strict=True):
+                right_side.index_add_(0, batch.columns.flatten(), seen)
+                gradient.index_add_(0, batch.neighbour.flatten(), across)
         packed = -torch.cholesky_solve(right_side[: len(self.gradient), None], factor.reduced)[:, 0]
         chain_step = self._substitute(packed, factor, gradient)
         along = (self.chain_gradient * chain_step).sum() + self.gradient @ packed
@@ -280,16 +287,25 @@ class ChainNormalEquations:
         # The gradient's column counts once, padding not at all.
         known = torch.cat((packed, packed.new_tensor([float(gradient is None), 0.0])))
         step = packed.new_zeros(len(structure.order), k)
-        batches = [batch for level in structure.levels for batch in level.batches]
-        by_batch = list(zip(batches, factor.inverses, factor.towards, strict=True))
-        for batch, inverse, leads in reversed(by_batch):
-            size = batch.fill.shape[1]
-            window = known[batch.columns].repeat_interleave(size, 0)[:, None]
+
+        def solve(item: tuple[Batch, Tensor, Tensor]) -> Tensor:
+            batch, inverse, leads = item
+            window = known[batch.columns].repeat_interleave(batch.fill.shape[1], 0)[:, None]
             own = (window @ _rows(batch, self.workspace.store)).mT
             if gradient is not None:
                 own = own + inverse @ gradient[batch.place][..., None]
             beside = step[batch.neighbour].flatten(1)[..., None]
-            step[batch.place] = (leads @ beside - own)[..., 0]
+            return (leads @ beside - own)[..., 0]
+
+        last = len(factor.inverses)
+        for level in reversed(structure.levels):
+            mine = slice(last - len(level.batches), last)
+            last = mine.start
+            items = list(
+                zip(level.batches, factor.inverses[mine], factor.towards[mine], strict=True)
+            )
+            for batch, part in zip(level.batches, in_order(solve, items, step.device), strict=True):
+                step[batch.place] = part
         return step[structure.place]
 
 
@@ -314,9 +330,9 @@ class _Part:
     """What the elimination of a batch leaves to others."""
 
     inverse: Float[Tensor, "e k k"]
-    towards: Float[Tensor, "e k sk"]
+    towards: Float[Tensor, "e k _"]
     """Minus the inverse diagonals times the links to the neighbours."""
-    square: Float[Tensor, "e sk sk"]
+    square: Float[Tensor, "e _ _"]
     """To be added to the neighbours' diagonals and to the link between them."""
     at: Int[Tensor, " ww"]
     product: Float[Tensor, " ww"]

@@ -22,7 +22,7 @@ class LinearRows:
     """Rows of a term, whitened: residuals, one Jacobian per slot, and the robust weights."""
 
     residual: Float[Tensor, "m d"]
-    jacobians: tuple[Float[Tensor, "m d k"], ...]
+    jacobians: tuple[Float[Tensor, "m d _"], ...]
     robust_weight: Float[Tensor, " m"]
     rho: Float[Tensor, " m"]
 
@@ -76,7 +76,7 @@ class RowGradients:
     """
 
     rho: Float[Tensor, " m"]
-    gradient: tuple[Float[Tensor, "k m"], ...]
+    gradient: tuple[Float[Tensor, "_ m"], ...]
     """`J_i^T W r` of every slot i."""
 
 
@@ -84,7 +84,7 @@ class RowGradients:
 class RowBlocks(RowGradients):
     """Every row's part of the normal equations."""
 
-    hessian: Mapping[tuple[int, int], Float[Tensor, "k l m"]]
+    hessian: Mapping[tuple[int, int], Float[Tensor, "_ _ m"]]
     """`J_i^T W J_j` of every two slots i <= j."""
 
 
@@ -112,7 +112,7 @@ def row_gradients(term: CostTerm, variables: dict[str, Variable], values: Values
 
 def blocks_of_jacobians(
     residual: Float[Tensor, "d m"],
-    jacobians: tuple[Float[Tensor, "d k m"], ...],
+    jacobians: tuple[Float[Tensor, "d _ m"], ...],
     robust_weight: Float[Tensor, " m"],
     rho: Float[Tensor, " m"],
 ) -> RowBlocks:
@@ -140,7 +140,7 @@ def sum_of_products(a: Float[Tensor, "d k m"], b: Float[Tensor, "d l m"]) -> Flo
 
 def autograd_jacobians(
     term: CostTerm, variables: dict[str, Variable], values: Values
-) -> tuple[Float[Tensor, "m d"], tuple[Float[Tensor, "m d k"], ...]]:
+) -> tuple[Float[Tensor, "m d"], tuple[Float[Tensor, "m d _"], ...]]:
     """Residuals and Jacobians (not whitened) by forward-mode autograd through every retraction."""
     blocks = tuple(values[name][block] for name, block in term.slots)
     kinds = [variables[name] for name, _ in term.slots]
