@@ -165,21 +165,20 @@ def term_costs(
     first = next(iter(values.values()))
     costs = {}
     for name, term in problem.terms.items():
-        total = first.new_zeros(problem.group_count)
         pieces = [piece for _, piece in chunks(term, chunk_rows)]
-        for piece, residual in zip(
-            pieces,
-            in_order(lambda piece: residuals(piece, values), pieces, first.device),
-            strict=True,
-        ):
-            rho = term.loss.rho(residual.square().sum(-1)) / 2
-            group = problem.group_of_rows(piece)
-            if group is None:
-                total[0] += rho.sum()
-            else:
-                total.index_add_(0, group, rho)
+        losses = in_order(lambda piece: _losses(problem, piece, values), pieces, first.device)
+        total = torch.stack([first.new_zeros(problem.group_count), *losses]).sum(0)
         costs[name] = total
     return costs
+
+
+def _losses(problem: Problem, piece: CostTerm, values: Values) -> Float[Tensor, " groups"]:
+    """`1/2 sum rho` of some rows, for each of the independent problems."""
+    rho = piece.loss.rho(residuals(piece, values).square().sum(-1)) / 2
+    group = problem.group_of_rows(piece)
+    if group is None:
+        return rho.sum()[None]
+    return rho.new_zeros(problem.group_count).index_add_(0, group, rho)
 
 
 def _whiten(term: CostTerm, residual: Float[Tensor, "m d"]) -> Float[Tensor, "m d"]:
