@@ -38,10 +38,7 @@ def point_reprojection_blocks(
     """`residuals.point_reprojection` by camera pose and point."""
     R, p = _planes(blocks[0])
     point = _turn(R, blocks[1].mT - p)
-    M = constants[0].permute(1, 2, 0).contiguous()
-    error, depth = _project(point, M)
-    error = error * weight
-    by_camera = _by_camera(error, weight, depth, M)
+    error, by_camera = _observed(point, constants[0], weight)
     pose, gradient, rho = _pose_blocks(R, point, error, by_camera, loss)
     return RowBlocks(
         rho,
@@ -60,12 +57,9 @@ def point_reprojection_gradient(
     """The gradient alone of `point_reprojection_blocks`."""
     R, p = _planes(blocks[0])
     point = _turn(R, blocks[1].mT - p)
-    M = constants[0].permute(1, 2, 0).contiguous()
-    error, depth = _project(point, M)
-    error = error * weight
+    error, by_camera = _observed(point, constants[0], weight)
     s = error.square().sum(0)
     pulled = error * loss.weight(s)
-    by_camera = _by_camera(error, weight, depth, M)
     force = (by_camera[0] * pulled[0]).addcmul_(by_camera[1], pulled[1])
     by_point = (R[:, 0] * force[0]).addcmul_(R[:, 1], force[1]).addcmul_(R[:, 2], force[2])
     by_turn = torch.linalg.cross(force, point, dim=0)
@@ -99,10 +93,8 @@ def sign_reprojection_blocks(
     corner = (template * blocks[2]).mT
     along = R_sign[:, 0] * corner[0], R_sign[:, 1] * corner[1]
     point = _turn(R, along[0] + along[1] + p_sign - p)
-    M = observation.permute(1, 2, 0).contiguous()
-    error, depth = _project(point, M)
-    error = error * weight
-    pose, gradient, rho = _pose_blocks(R, point, error, _by_camera(error, weight, depth, M), loss)
+    error, by_camera = _observed(point, observation, weight)
+    pose, gradient, rho = _pose_blocks(R, point, error, by_camera, loss)
     # The corner by the sign's turning about its axes, R_sign (w x corner), and by its size; moving it is the identity.
     x, y = corner
     normal = R_sign[:, 2]
@@ -159,11 +151,9 @@ def lane_reprojection_blocks(
     weights, normal_px, observation = constants
     R, p = _planes(blocks[0])
     point = _turn(R, _spline_point(blocks[1:], weights) - p)
-    M = observation.permute(1, 2, 0).contiguous()
-    error, depth = _project(point, M)
+    error, by_camera = _observed(point, observation, weight)
     normal = normal_px.mT
-    by_camera = _by_camera(error * weight, weight, depth, M)
-    along = ((normal * error).sum(0) * weight)[None]
+    along = (normal * error).sum(0)[None]
     by_camera = (normal[0] * by_camera[0]).addcmul_(normal[1], by_camera[1])[None]
     return _spline_blocks(_pose_blocks(R, point, along, by_camera, loss), weights)
 
@@ -279,16 +269,16 @@ def _project(
     return u[:2] / depth, depth
 
 
-def _by_camera(
-    error: Float[Tensor, "2 m"],
-    weight: Float[Tensor, " m"],
-    depth: Float[Tensor, " m"],
-    M: Float[Tensor, "3 3 m"],
-) -> Float[Tensor, "2 3 m"]:
-    """Derivative of the whitened pixel error by the camera-frame point."""
+def _observed(
+    point: Float[Tensor, "3 m"], observation: Float[Tensor, "m 3 3"], weight: Float[Tensor, " m"]
+) -> tuple[Float[Tensor, "2 m"], Float[Tensor, "2 3 m"]]:
+    """Whitened pixel errors of camera-frame points, and their derivatives by the points."""
+    M = observation.permute(1, 2, 0).contiguous()
+    error, depth = _project(point, M)
+    error = error * weight
     # Where the depth is held it has no part in the derivative.
     slope = torch.where(depth > MIN_DEPTH, error, 0.0)
-    return (M[:2] * weight - slope[:, None] * M[2]) / depth
+    return error, (M[:2] * weight - slope[:, None] * M[2]) / depth
 
 
 def _pose_blocks(
