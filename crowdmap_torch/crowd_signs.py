@@ -15,6 +15,8 @@ from crowdmap_torch.tables import Journey, Signs, Tracklets
 
 _FASTEST_MPS = 70.0
 """No car is faster [m/s]: a longer step between two frames is a fault of the positions."""
+_HARDEST_MPS2 = 12.0
+"""Acceleration [m/s^2] that no car exceeds."""
 
 _ONE_PLACE = 0.5
 """Detections nearer to each other in the image than this share of the smaller one show one sign."""
@@ -83,7 +85,7 @@ def gather_signs(
     for j, (journey, found) in enumerate(zip(journeys, tracklets, strict=True)):
         rows = torch.nonzero(signs.journey == j)[:, 0]
         distance = along_track(journey.T_world_camera)
-        leap[j] = _largest_leap(journey)
+        leap[j] = largest_leap(journey)
         frame = signs.frame[rows]
         station[rows] = distance[frame]
         view[rows] = journey.T_world_camera[frame]
@@ -147,12 +149,22 @@ def pairs_seen_together(
     return pairs[low != high]
 
 
-def _largest_leap(journey: Journey) -> Float[Tensor, ""]:
+def largest_leap(journey: Journey) -> Float[Tensor, ""]:
+    """Largest step [m] beyond what the steps before and behind it, and a car's brakes and tyres, explain."""
     position = journey.T_world_camera[:, :3, 3]
-    step = position.diff(dim=0).norm(dim=1)
+    step = position.diff(dim=0)
     seconds = journey.t_ns.diff().to(step) * 1e-9
-    beyond = (step - _FASTEST_MPS * seconds).clamp_min(0)
-    return torch.cat((beyond, beyond.new_zeros(1))).max()
+    if len(step) < 2:
+        return (step.norm(dim=1) - _FASTEST_MPS * seconds).clamp_min(0).sum()
+    velocity = step / seconds[:, None]
+    # The speed of a step is that of its middle: from there to the next step's middle it may change.
+    change = _HARDEST_MPS2 * (seconds[1:] + seconds[:-1]) / 2
+    apart = (velocity[1:] - velocity[:-1]).norm(dim=1)
+    beyond = (apart - change).clamp_min(0)
+    # A leap stands out against both of its neighbours, a car that pulls away after one does not.
+    none = beyond.new_full((1,), torch.inf)
+    either = torch.minimum(torch.cat((none, beyond)), torch.cat((beyond, none)))
+    return (either * seconds).max()
 
 
 def with_covariance(signs: Signs, extra: Float[Tensor, "n 3 3"]) -> Signs:
