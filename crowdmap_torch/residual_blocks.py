@@ -455,12 +455,12 @@ def _log(R: Float[Tensor, "3 3 m"]) -> Float[Tensor, "3 m"]:
     cosine = (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2
     if bool((cosine < 0.1).any()):
         return se3.so3_log(R.permute(2, 0, 1)).mT
-    sine = twice.square().sum(0).sqrt() / 2
-    small = sine < 1e-4
-    angle = torch.atan2(sine, cosine)
-    return (
-        twice / 2 * torch.where(small, 1 + sine.square() / 6, angle / torch.where(small, 1.0, sine))
-    )
+    square = twice.square().sum(0)
+    small = square < 4e-8
+    # Double `where`: the root at zero has no gradient.
+    sine = torch.where(small, 1.0, square).sqrt() / 2
+    factor = torch.where(small, 1 + square / 24, torch.atan2(sine, cosine) / sine)
+    return twice / 2 * factor
 
 
 def _pulled_back(w: Float[Tensor, "3 m"], v: Float[Tensor, "3 m"]) -> Float[Tensor, "3 m"]:

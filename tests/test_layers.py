@@ -22,6 +22,7 @@ LEVELS = {
     "simulate": 2,
     "stages": 3,
     "config": 4,
+    "control": 4,
     "crowd": 4,
     "evaluate": 4,
     "evaluation": 4,

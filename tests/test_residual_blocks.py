@@ -232,3 +232,21 @@ def test_chain_rule_jacobians_are_those_of_autograd(make):
     theirs = row_blocks(replace(term, normal=None), VARIABLES, values)
     for pair, block in ours.hessian.items():
         torch.testing.assert_close(block, theirs.hessian[pair], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", TERMS)
+def test_gradients_by_autograd_are_finite_everywhere(make):
+    term, values = make(Quadratic())
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    whitened(term, leaves).square().sum().backward()
+    for name in {slot for slot, _ in term.slots}:
+        gradient = leaves[name].grad
+        assert gradient is not None and bool(gradient.isfinite().all())
+
+
+def test_a_pose_at_its_prior_has_a_gradient():
+    pose = poses(0).requires_grad_()
+    deviation = residual_blocks.pose_prior(pose, pose.detach())
+    deviation.square().sum().backward()
+    assert pose.grad is not None
+    torch.testing.assert_close(pose.grad, torch.zeros_like(pose.grad), rtol=0, atol=1e-12)
