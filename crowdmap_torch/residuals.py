@@ -232,20 +232,6 @@ def sign_reprojection_jacobian(
     return error, (by_pose, torch.cat((by_point, by_rotation), dim=-1), by_size)
 
 
-def sign_corner_jacobian(
-    T_world_sign: Float[Tensor, "m 4 4"],
-    size: Float[Tensor, "m 2"],
-    T_world_camera: Float[Tensor, "m 4 4"],
-    template: Float[Tensor, "m 2"],
-    observation: Float[Tensor, "m 3 3"],
-) -> tuple[Float[Tensor, "m 2"], tuple[Tensor, Tensor]]:
-    """`sign_reprojection` by sign pose and relative size alone, the cameras held (IV-B)."""
-    error, (_, by_sign, by_size) = sign_reprojection_jacobian(
-        T_world_camera, T_world_sign, size, template, observation
-    )
-    return error, (by_sign, by_size)
-
-
 def lane_reprojection_jacobian(
     T_world_camera: Float[Tensor, "m 4 4"],
     c0: Float[Tensor, "m 3"],
