@@ -24,13 +24,6 @@ def fundamental(
     return se3.skew(T_a_b[..., :3, 3]) @ T_a_b[..., :3, :3]
 
 
-def infinite_homography(
-    T_world_a: Float[Tensor, "*#batch 4 4"], T_world_b: Float[Tensor, "*#batch 4 4"]
-) -> Float[Tensor, "*#batch 3 3"]:
-    """The rotation R_a_b: it carries rays of b to a if the point is far or the car stands."""
-    return T_world_a[..., :3, :3].mT @ T_world_b[..., :3, :3]
-
-
 def epipolar_cost(
     F_ab: Float[Tensor, "*#batch 3 3"],
     p_a: Float[Tensor, "*#batch k"],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
@@ -32,22 +32,6 @@ def scatter(
     mu = (weight[..., None] * points).sum(-2) / torch.where(total > 0, total, 1.0)
     centred = points - mu[..., None, :]
     return mu, (weight[..., None] * centred).mT @ centred
-
-
-def scatter_ragged(
-    points: Float[Tensor, "m 3"],
-    group: Int[Tensor, " m"],
-    count: int,
-    weight: Float[Tensor, " m"] | None = None,
-) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3 3"]]:
-    """`scatter` of each of `count` groups of points; zero for an empty group."""
-    weight = torch.ones_like(points[:, 0]) if weight is None else weight
-    total = weight.new_zeros(count).index_add(0, group, weight)[:, None]
-    mu = points.new_zeros(count, 3).index_add(0, group, weight[:, None] * points)
-    mu = mu / torch.where(total > 0, total, 1.0)
-    centred = points - mu[group]
-    outer = weight[:, None, None] * centred[:, :, None] * centred[:, None, :]
-    return mu, points.new_zeros(count, 3, 3).index_add(0, group, outer)
 
 
 def smallest_singular_value(S: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:

@@ -43,17 +43,6 @@ def test_harmonic_mean_is_that_of_the_singular_values(generator):
     assert plane.harmonic_mean_singular_value(torch.zeros(3, 3)).item() == 0
 
 
-def test_ragged_scatter_is_the_scatter_of_each_group(generator):
-    group = torch.tensor([1, 0, 1, 1, 3, 0, 3, 3, 1])
-    points = 1000 + torch.randn(9, 3, generator=generator, dtype=torch.float64)
-    weight = torch.rand(9, generator=generator, dtype=torch.float64)
-    mu, S = plane.scatter_ragged(points, group, 4, weight)
-    for g in (0, 1, 3):
-        alone = plane.scatter(points[group == g], weight[group == g])
-        torch.testing.assert_close((mu[g], S[g]), alone)
-    assert torch.equal(S[2], torch.zeros(3, 3, dtype=torch.float64))
-
-
 def test_intersection_lies_on_ray_and_plane(generator):
     origin, ray, point, normal = torch.randn(4, 50, 3, generator=generator, dtype=torch.float64)
     hit = plane.intersect_plane(origin, ray, point, normal)
