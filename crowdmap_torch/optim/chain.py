@@ -164,7 +164,7 @@ class ChainNormalEquations:
     def slope(self, delta: Mapping[str, Tensor]) -> Float[Tensor, " 1"]:
         """Derivative of the cost along `delta`."""
         of = unpack(self.gradient[None], self.structure.where)
-        of.update(self._unstack(self.chain_gradient))
+        of.update(self.unstack(self.chain_gradient))
         return torch.stack([(of[name] * delta[name]).sum() for name in delta]).sum()[None]
 
     def solve(self, damping: Float[Tensor, " 1"]) -> Step:
@@ -214,7 +214,7 @@ class ChainNormalEquations:
 
     def _step(self, packed: Tensor, chain_step: Tensor, predicted: Tensor) -> Step:
         delta = unpack(packed[None], self.structure.where)
-        delta.update(self._unstack(chain_step))
+        delta.update(self.unstack(chain_step))
         norm = (chain_step.square().sum() + packed.square().sum()).sqrt()
         return Step(delta, predicted[None], norm.isfinite()[None], norm[None])
 
@@ -222,12 +222,63 @@ class ChainNormalEquations:
         """Covariance of all variables but the eliminated one, jointly, the eliminated one marginalised."""
         nothing = torch.zeros_like(self.diagonal[..., 0])
         # The floor keeps a landmark that nothing observes invertible; its variance says so.
-        matrix, *_ = self._reduce(nothing, torch.full_like(self.gradient, floor))
+        added = torch.full_like(self.gradient, floor)
+        matrix, _, inverses, towards = self._reduce(nothing, added)
         if not bool(matrix.isfinite().all()):
             raise ValueError("the chain's blocks are not positive definite without damping")
-        return torch.cholesky_inverse(torch.linalg.cholesky(matrix))
+        reduced = torch.linalg.cholesky(matrix)
+        self.workspace.factor = _Factor(inverses, towards, reduced)
+        return torch.cholesky_inverse(reduced)
 
-    def _unstack(self, stacked: Tensor) -> dict[str, Tensor]:
+    def solve_reduced(self, right: Float[Tensor, "r m"]) -> Float[Tensor, "r m"]:
+        """Landmarks that solve the last factorised reduced system for other right-hand sides."""
+        assert self.workspace.factor is not None
+        return torch.cholesky_solve(right, self.workspace.factor.reduced)
+
+    def solve_chains(self, right: Float[Tensor, "n k m"]) -> Float[Tensor, "n k m"]:
+        """Eliminated blocks that solve the last factorised system with the landmarks held.
+
+        Chains do not touch each other then: one column serves as many right-hand sides as there are chains.
+        """
+        structure, factor = self.structure, self.workspace.factor
+        assert factor is not None
+        force = right.new_zeros(len(structure.order), *right.shape[1:])
+        force[structure.place] = right
+        solved = torch.zeros_like(force)
+        batches = [batch for level in structure.levels for batch in level.batches]
+        steps = list(zip(batches, factor.inverses, factor.towards, strict=True))
+        for batch, _, leads in steps:
+            passed = (leads.mT @ force[batch.place]).view(-1, *right.shape[1:])
+            force.index_add_(0, batch.neighbour.flatten(), passed)
+        for batch, inverse, leads in reversed(steps):
+            beside = solved[batch.neighbour].flatten(1, 2)
+            solved[batch.place] = inverse @ force[batch.place] + leads @ beside
+        return solved[structure.place]
+
+    def by_landmark(
+        self, moved: Float[Tensor, "n k m"], owner: Int[Tensor, " n"], owners: int
+    ) -> Float[Tensor, "r owners m"]:
+        """What moved eliminated blocks add to the landmarks' gradient, by who owns the block."""
+        total = moved.new_zeros(len(self.gradient) * owners, moved.shape[-1])
+        for name, block in self.coupling.items():
+            coupling = self.structure.couplings[name]
+            for at in range(0, len(block), CHUNK_ROWS):
+                here = slice(at, at + CHUNK_ROWS)
+                index = coupling.block[here]
+                place = coupling.column[here] * owners + owner[index][:, None]
+                total.index_add_(0, place.flatten(), (block[here] @ moved[index]).flatten(0, 1))
+        return total.view(-1, owners, moved.shape[-1])
+
+    def by_block(self, moved: Float[Tensor, " r"]) -> Float[Tensor, "n k"]:
+        """What moved landmarks add to the eliminated blocks' gradient."""
+        total = torch.zeros_like(self.chain_gradient)
+        for name, block in self.coupling.items():
+            coupling = self.structure.couplings[name]
+            pushed = (moved[coupling.column][:, None] @ block)[:, 0]
+            total.index_add_(0, coupling.block, pushed)
+        return total
+
+    def unstack(self, stacked: Tensor) -> dict[str, Tensor]:
         """Rows of the leaves and of the chain, by variable."""
         base = self.structure.base
         bounds = [*base.values(), len(stacked)]
@@ -235,7 +286,7 @@ class ChainNormalEquations:
 
     def _failed(self) -> Step:
         delta = unpack(torch.zeros_like(self.gradient)[None], self.structure.where)
-        delta.update(self._unstack(torch.zeros_like(self.chain_gradient)))
+        delta.update(self.unstack(torch.zeros_like(self.chain_gradient)))
         zero = torch.zeros_like(self.cost)
         return Step(delta, zero, torch.zeros_like(zero, dtype=torch.bool), zero)
 
