@@ -32,6 +32,8 @@ LEVELS = {
     "single_journey": 4,
     "run_metrics": 5,
     "benchmark": 6,
+    "studies": 6,
+    "subcommands": 6,
     "": 6,
 }
 """The layer of each module or package; the package's own `__init__` ("") may import all of them."""
@@ -141,8 +143,8 @@ def test_a_library_is_imported_in_one_place(library: str, only: str) -> None:
 
 
 def test_the_library_does_not_print() -> None:
-    # Benchmarks print tables: they are the inside of a script.
-    for path in (p for p in MODULES if unit(name_of(p)) != "benchmark"):
+    # Benchmarks and studies print tables: they are the inside of a script.
+    for path in (p for p in MODULES if unit(name_of(p)) not in ("benchmark", "studies")):
         calls = (n.func for n in ast.walk(tree(path)) if isinstance(n, ast.Call))
         prints = [f.lineno for f in calls if isinstance(f, ast.Name) and f.id == "print"]
         assert not prints, f"{path}: print in lines {prints}; return numbers, report/ shows them"

@@ -107,17 +107,17 @@ def evaluate_samples(
     seen = torch.ones_like(true.line, dtype=torch.bool)
     if seen_by is not None:
         seen = seen_by >= config.min_journeys
-    by_line = _within(true, mapped, config)
+    by_line = within_gate(true, mapped, config)
     found = nearest(by_line)
     covered = torch.bincount(by_line.point, minlength=len(true))
-    back = _within(mapped, true, config)
+    back = within_gate(mapped, true, config)
     right = torch.zeros_like(mapped.line, dtype=torch.bool).index_fill(0, back.point, True)
     weight_true, weight_map = length_of_samples(true), length_of_samples(mapped)
     seen_length = weight_true[seen]
     unshifted = (
         replace(mapped, point_world=mapped.point_world - shift) if shift is not None else mapped
     )
-    clean = nearest(_within(true, unshifted, config)) if shift is not None else found
+    clean = nearest(within_gate(true, unshifted, config)) if shift is not None else found
     return LaneFigures(
         true_length_m=float(weight_true.sum()),
         seen_length_m=float(seen_length.sum()),
@@ -129,7 +129,7 @@ def evaluate_samples(
         vertical=error_figures(found.vertical.abs()),
         lateral_without_shift=error_figures(clean.lateral.abs()),
         vertical_without_shift=error_figures(clean.vertical.abs()),
-        width=error_figures(_width_errors(true, mapped, found, config)),
+        width=error_figures(width_errors(true, mapped, found, config)),
         sigma_coverage=_coverage(true, clean, shared_covariance),
     )
 
@@ -142,7 +142,8 @@ def length_of_samples(samples: Samples) -> Float[Tensor, " p"]:
     return torch.cat((edge, half)) + torch.cat((half, edge))
 
 
-def _within(at: Samples, lines: Samples, config: LaneEvaluationConfig) -> Crossings:
+def within_gate(at: Samples, lines: Samples, config: LaneEvaluationConfig) -> Crossings:
+    """Where `lines` cross beside the samples `at`, near enough to be the same marker."""
     return crossings(at, lines, lateral_m=config.lateral_gate_m, vertical_m=config.vertical_gate_m)
 
 
@@ -151,10 +152,13 @@ def _share_of(weight: Tensor, part: Tensor, whole: Tensor) -> float:
     return float(weight[part].sum()) / total if total > 0 else math.nan
 
 
-def _width_errors(
+def width_errors(
     true: Samples, mapped: Samples, found: Crossings, config: LaneEvaluationConfig
 ) -> Float[Tensor, " w"]:
-    """Absolute errors of the distance to the left neighbour, at found points a few metres apart."""
+    """Absolute errors of the distance to the left neighbour, at found points a few metres apart.
+
+    `found` are the places where the nearest line of the map crosses beside the true points.
+    """
     every = max(round(config.width_step_m / config.step_m), 1)
     own = found[(found.point % every) == 0]
     at = true[own.point]

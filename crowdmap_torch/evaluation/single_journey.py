@@ -8,9 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.evaluation.lanes import LaneEvaluationConfig, survey_samples
+from crowdmap_torch.evaluation.lanes import (
+    LaneEvaluationConfig,
+    survey_samples,
+    width_errors,
+    within_gate,
+)
 from crowdmap_torch.evaluation.matching import DUPLICATE, FALSE, near_pairs
-from crowdmap_torch.evaluation.polyline import Samples, crossings, nearest, sample_lanes
+from crowdmap_torch.evaluation.polyline import Samples, nearest, sample_lanes
 from crowdmap_torch.evaluation.signs import SignEvaluationConfig, compare_signs
 from crowdmap_torch.evaluation.statistics import (
     ErrorFigures,
@@ -68,6 +73,8 @@ class SingleJourneyFigures:
     """Share of the landmarks further than 3 m from every true sign."""
     lane_lateral: ErrorFigures
     lane_vertical: ErrorFigures
+    lane_width: ErrorFigures
+    """Of the distance between neighbouring markers."""
     lane_precision: float
     """Share of the lanes' length within the gate of a true marker."""
 
@@ -82,6 +89,7 @@ class _Part:
     normal_deg: Float[Tensor, " k"]
     lateral: Float[Tensor, " p"]
     vertical: Float[Tensor, " p"]
+    width: Float[Tensor, " w"]
     expected: int
     found: int
     duplicates: int
@@ -106,9 +114,17 @@ def evaluate_single_journeys(
     ]
     if not parts:
         raise ValueError("no journey to evaluate: expected at least one with landmarks and truth")
-    corner, mask, center, normal, lateral, vertical = (
+    corner, mask, center, normal, lateral, vertical, width = (
         torch.cat([getattr(p, name) for p in parts])
-        for name in ("corner", "corner_mask", "center", "normal_deg", "lateral", "vertical")
+        for name in (
+            "corner",
+            "corner_mask",
+            "center",
+            "normal_deg",
+            "lateral",
+            "vertical",
+            "width",
+        )
     )
     signs = sum(p.signs for p in parts)
     return SingleJourneyFigures(
@@ -124,6 +140,7 @@ def evaluate_single_journeys(
         ghosts=share(sum(p.false for p in parts), signs),
         lane_lateral=error_figures(lateral.abs()),
         lane_vertical=error_figures(vertical.abs()),
+        lane_width=error_figures(width),
         lane_precision=share(sum(p.lane_right for p in parts), sum(p.lane_samples for p in parts)),
     )
 
@@ -148,14 +165,8 @@ def _evaluate_one(
     mapped = replace(mapped, point_world=moved)
     # From the map's points to the true markers: a journey sees pieces, and nobody expects the rest
     # of it.
-    on_marker = nearest(
-        crossings(
-            mapped,
-            true_samples,
-            lateral_m=config.lanes.lateral_gate_m,
-            vertical_m=config.lanes.vertical_gate_m,
-        )
-    )
+    on_marker = nearest(within_gate(mapped, true_samples, config.lanes))
+    beside_marker = nearest(within_gate(true_samples, mapped, config.lanes))
     return _Part(
         corner=c.corner_error_world,
         corner_mask=c.corner_mask,
@@ -163,6 +174,7 @@ def _evaluate_one(
         normal_deg=c.normal_deg,
         lateral=on_marker.lateral,
         vertical=on_marker.vertical,
+        width=width_errors(true_samples, mapped, beside_marker, config.lanes),
         expected=int(expected.sum()),
         found=int((expected & found).sum()),
         duplicates=int((c.match.true_of_map == DUPLICATE).sum()),

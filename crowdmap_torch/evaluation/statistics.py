@@ -1,4 +1,4 @@
-"""Mean, median and 95th percentile of errors, and how they turn into plain JSON."""
+"""Mean, median, 95th percentile and spread of errors, and how they turn into plain JSON."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ class ErrorFigures:
     median: float
     p95: float
     """95th percentile, interpolated linearly."""
+    std: float
+    """1-sigma about the mean."""
     count: int
 
 
 def error_figures(error: Float[Tensor, " n"]) -> ErrorFigures:
-    """Mean, median and 95th percentile of errors; what is not finite is unknown and left out."""
+    """Mean, median, 95th percentile and spread of errors; what is not finite is unknown and left out."""
     known = error[error.isfinite()]
     if len(known) == 0:
-        return ErrorFigures(math.nan, math.nan, math.nan, 0)
+        return ErrorFigures(math.nan, math.nan, math.nan, math.nan, 0)
     # torch.quantile refuses more than 16 million elements; a sorted copy has no such limit.
     ordered = known.sort().values
     return ErrorFigures(
         mean=float(ordered.mean()),
         median=_quantile(ordered, 0.5),
         p95=_quantile(ordered, 0.95),
+        std=float(ordered.std(correction=0)),
         count=len(ordered),
     )
 

@@ -67,6 +67,7 @@ def _lines(figures: MapFigures) -> Iterator[str]:
         yield _errors("normal [deg]", one.normal_deg)
         yield _errors("lane lateral", one.lane_lateral)
         yield _errors("lane vertical", one.lane_vertical)
+        yield _errors("lane width", one.lane_width)
         yield _row("sign recall", _percent(one.recall))
         yield _row("ghosts / duplicates", f"{_percent(one.ghosts)} / {_percent(one.duplicates)}")
         yield _row("lane precision", _percent(one.lane_precision))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
@@ -33,18 +33,22 @@ def write_report(path: Path, record: RunRecord) -> None:
 
 def report_html(record: RunRecord) -> str:
     """The report as text."""
-    sections = [s for s in _sections(record) if s[2]]
-    links = "".join(f'<a href="#{name}">{escape(title)}</a>' for name, title, _ in sections)
+    return page_html(record.title, record.subtitle, [s for s in _sections(record) if s[2]])
+
+
+def page_html(title: str, subtitle: str, sections: Sequence[tuple[str, str, str]]) -> str:
+    """A page of sections (anchor, title and content), complete in itself."""
+    links = "".join(f'<a href="#{name}">{escape(heading)}</a>' for name, heading, _ in sections)
     body = "".join(
-        f'<section id="{name}"><h2>{escape(title)}</h2>{content}</section>'
-        for name, title, content in sections
+        f'<section id="{name}"><h2>{escape(heading)}</h2>{content}</section>'
+        for name, heading, content in sections
     )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{escape(record.title)}</title><style>{STYLE}</style></head><body>"
-        f'<header><div class="wrap"><h1>{escape(record.title)}</h1>'
-        f"<p>{escape(record.subtitle)}</p></div></header>"
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>"
+        f'<header><div class="wrap"><h1>{escape(title)}</h1>'
+        f"<p>{escape(subtitle)}</p></div></header>"
         f'<nav><div class="wrap">{links}</div></nav><main class="wrap">{body}</main>'
         '<footer class="wrap">All lengths in metres, east north up from the map\'s origin. '
         f"</footer><script>{SCRIPT}</script></body></html>\n"
@@ -67,7 +71,7 @@ def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
 
 
 def _map(record: RunRecord) -> str:
-    return _note("From above. A click on a row of the table of signs brings it here.") + map_svg(
+    return note("From above. A click on a row of the table of signs brings it here.") + map_svg(
         record
     )
 
@@ -75,17 +79,17 @@ def _map(record: RunRecord) -> str:
 def _errors(record: RunRecord) -> str:
     if record.figures is None:
         return ""
-    drawing = ""
+    drawn = ""
     if record.comparison is not None and bool(record.comparison.counted.any()):
         oracle = record.figures.oracle
-        drawing = _drawing(
+        drawn = drawing(
             plots.plot_sign_errors(
                 record.comparison,
                 record.comparison_before,
                 oracle_m=oracle.total.mean if oracle is not None else float("nan"),
             )
         )
-    return drawing + error_table(record.figures, record.figures_before)
+    return drawn + error_table(record.figures, record.figures_before)
 
 
 def _journeys(record: RunRecord) -> str:
@@ -103,8 +107,8 @@ def _journeys(record: RunRecord) -> str:
     if not record.journeys:
         return warning
     return (
-        _note("Bias: what the positioning module got wrong, in the mean over the journey.")
-        + _drawing(plots.plot_bias(record.journeys))
+        note("Bias: what the positioning module got wrong, in the mean over the journey.")
+        + drawing(plots.plot_bias(record.journeys))
         + bias_table(record.journeys)
         + warning
     )
@@ -113,16 +117,16 @@ def _journeys(record: RunRecord) -> str:
 def _clusters(record: RunRecord) -> str:
     if not record.spectra:
         return ""
-    return _note(
+    return note(
         "Eigenvalues of the graph Laplacian: as many are small as there are landmarks; "
         "the gap after them is where the number was read off."
-    ) + _drawing(plots.plot_spectrum(record.spectra))
+    ) + drawing(plots.plot_spectrum(record.spectra))
 
 
 def _residuals(record: RunRecord) -> str:
     if not any(len(r) for r in record.residual_px.values()):
         return ""
-    return _note("Share of the reprojection residuals below each size, stage by stage.") + _drawing(
+    return note("Share of the reprojection residuals below each size, stage by stage.") + drawing(
         plots.plot_residuals(record.residual_px)
     )
 
@@ -134,7 +138,7 @@ def _adjustment(record: RunRecord) -> str:
     first, last = record.iterations[0].total, record.iterations[-1].total
     outcome = record.outcome[:1].upper() + record.outcome[1:]
     told = f"{steps} iterations, cost {first:.4g} to {last:.4g}. {outcome}".strip()
-    return _note(told) + _drawing(plots.plot_convergence(record.iterations))
+    return note(told) + drawing(plots.plot_convergence(record.iterations))
 
 
 def _pruned(record: RunRecord) -> str:
@@ -161,9 +165,11 @@ def _count(value: float | str) -> str:
     return f"{value:,.0f}" if float(value).is_integer() else f"{value:.3f}"
 
 
-def _drawing(figure: Figure) -> str:
+def drawing(figure: Figure) -> str:
+    """A figure, as an element of a page."""
     return f'<div class="box">{plots.svg(figure)}</div>'
 
 
-def _note(text: str) -> str:
+def note(text: str) -> str:
+    """A paragraph beside a figure or table."""
     return f'<p class="note">{escape(text)}</p>'

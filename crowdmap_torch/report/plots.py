@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import matplotlib as mpl
@@ -20,6 +21,7 @@ from torch import Tensor
 from crowdmap_torch.evaluation.polyline import sample_lanes
 from crowdmap_torch.evaluation.signs import SignComparison
 from crowdmap_torch.evaluation.statistics import mean_lengths
+from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.report.record import Iteration, JourneySummary, Spectrum
 from crowdmap_torch.tables import HdMap, Survey
 
@@ -60,15 +62,15 @@ _STYLE: dict[Any, Any] = {
 Plot = TypeVar("Plot", bound=Callable[..., Figure])
 
 
-def _styled(plot: Plot) -> Plot:
+def styled(plot: Plot) -> Plot:
     """The same function, drawing in the style of the report whatever the style of the caller."""
     return cast(Plot, mpl.rc_context(_STYLE)(plot))
 
 
-@_styled
+@styled
 def plot_map(hd_map: HdMap, survey: Survey | None = None, *, title: str = "") -> Figure:
     """A map from above, the survey under it."""
-    figure, (axes,) = _figure(1, width=9.0, height=5.0)
+    figure, (axes,) = new_figure(1, width=9.0, height=5.0)
     if survey is not None:
         line = survey.lane_points.lane
         _draw_lines(axes, survey.lane_points.point_world, line, SURVEY, width=2.4, alpha=0.45)
@@ -93,12 +95,12 @@ def plot_map(hd_map: HdMap, survey: Survey | None = None, *, title: str = "") ->
     return figure
 
 
-@_styled
+@styled
 def plot_sign_errors(
     comparison: SignComparison, before: SignComparison | None = None, *, oracle_m: float = math.nan
 ) -> Figure:
     """Histograms of the absolute and the relative error of signs (`sign_errors`)."""
-    figure, panels = _figure(2, width=9.0, height=2.9)
+    figure, panels = new_figure(2, width=9.0, height=2.9)
     for axes, name in zip(panels, ("absolute", "relative"), strict=True):
         now = sign_errors(comparison, name)
         then = sign_errors(before, name) if before is not None else now[:0]
@@ -130,10 +132,10 @@ def sign_errors(comparison: SignComparison, name: str) -> Float[Tensor, " k"]:
     return error[c.counted & c.has_relative if name == "relative" else c.counted]
 
 
-@_styled
+@styled
 def plot_bias(journeys: Sequence[JourneySummary]) -> Figure:
     """The bias of each journey from above, and its height; the true one where it is known."""
-    figure, (plan, height) = _figure(2, width=9.0, height=3.4)
+    figure, (plan, height) = new_figure(2, width=9.0, height=3.4)
     bias = np.array([j.bias for j in journeys]).reshape(-1, 3)
     known = [k for k, j in enumerate(journeys) if j.true_bias is not None]
     true = np.array([j.true_bias for j in journeys if j.true_bias is not None]).reshape(-1, 3)
@@ -155,10 +157,10 @@ def plot_bias(journeys: Sequence[JourneySummary]) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def plot_spectrum(spectra: Sequence[Spectrum]) -> Figure:
     """Eigenvalues of graph Laplacians, ascending, and the gap that was chosen."""
-    figure, panels = _figure(max(len(spectra), 1), width=9.0, height=2.9)
+    figure, panels = new_figure(max(len(spectra), 1), width=9.0, height=2.9)
     for axes, spectrum in zip(panels, spectra, strict=False):
         value = np.asarray(spectrum.eigenvalue)
         number = np.arange(1, len(value) + 1)
@@ -182,10 +184,10 @@ def plot_spectrum(spectra: Sequence[Spectrum]) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def plot_residuals(residual_px: Mapping[str, Float[Tensor, " n"]]) -> Figure:
     """The share of residuals below each size, stage by stage; further left is better."""
-    figure, (axes,) = _figure(1, width=9.0, height=3.0)
+    figure, (axes,) = new_figure(1, width=9.0, height=3.0)
     for (stage, residual), color in zip(residual_px.items(), SERIES * 9, strict=False):
         # Exact zeros have no logarithm.
         known = residual.detach().abs()[residual.isfinite()].clamp_min(1e-3).sort().values.cpu()
@@ -204,12 +206,12 @@ def plot_residuals(residual_px: Mapping[str, Float[Tensor, " n"]]) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def plot_convergence(iterations: Sequence[Iteration]) -> Figure:
     """Cost of every term, and the error against the survey as it falls, over the iterations."""
     tags = ("error/corner_m", "error/corner_relative_m", "error/lane_lateral_m")
     tags = tuple(t for t in tags if any(t in i.errors for i in iterations))
-    figure, panels = _figure(2 if tags else 1, width=9.0, height=2.9)
+    figure, panels = new_figure(2 if tags else 1, width=9.0, height=2.9)
     number = [i.number for i in iterations]
     terms = list(dict.fromkeys(term for i in iterations for term in i.cost))
     axes = panels[0]
@@ -240,6 +242,13 @@ def svg(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
+def write_png(figure: Figure, path: Path) -> None:
+    """A figure as an image file, complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as beside, mpl.rc_context(_STYLE):
+        figure.savefig(beside, format="png", dpi=130)
+
+
 def pixels(figure: Figure) -> UInt8[np.ndarray, "h w 3"]:
     """A figure as an image."""
     canvas = FigureCanvasAgg(figure)
@@ -248,9 +257,13 @@ def pixels(figure: Figure) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _figure(panels: int, *, width: float, height: float) -> tuple[Figure, list[Axes]]:
+def new_figure(
+    panels: int, *, width: float, height: float, rows: int = 1
+) -> tuple[Figure, list[Axes]]:
+    """An empty figure with panels side by side, in `rows` rows."""
+    columns = -(-panels // rows)
     figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, [figure.add_subplot(1, panels, k + 1) for k in range(panels)]
+    return figure, [figure.add_subplot(rows, columns, k + 1) for k in range(panels)]
 
 
 def _draw_lines(

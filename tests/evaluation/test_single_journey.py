@@ -29,6 +29,18 @@ def test_the_pose_error_is_taken_off(build):
     assert figures.lane_precision == 1
 
 
+def test_the_width_between_markers_is_that_of_the_journey_alone(build):
+    bias = (0.8, -0.6, 1.0)
+    drive = build.drive("a", bias=bias)
+    survey = build.survey(build.signs([]), [build.straight(2.0), build.straight(5.5)])
+    right = build.straight(2.0 - 0.6 + 0.02, start=10.8, end=60.8, z=1.0)
+    left = build.straight(5.5 - 0.6 + 0.05, start=10.8, end=60.8, z=1.0)
+    landmarks = JourneyLandmarks("a", build.signs([]), build.lanes([right, left]))
+    figures = evaluate_single_journeys([landmarks], [drive], survey)
+    assert figures.lane_width.count >= 15
+    assert figures.lane_width.mean == pytest.approx(0.03, abs=1e-6)
+
+
 def test_recall_expects_signs_of_ten_frames_only(build):
     true = build.signs([[40.0, 4, 2], [60, -4, 2], [80, 4, 2]])
     rows = [(f, 0) for f in range(10)] + [(f, 1) for f in range(9)] + [(f, 2) for f in range(20)]
