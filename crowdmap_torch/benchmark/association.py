@@ -13,9 +13,9 @@ from crowdmap_torch.config import METHODS, MapperConfig
 from crowdmap_torch.evaluate import MapFigures, evaluate_map
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.truth import SignAssociations
-from crowdmap_torch.mapper import MapResult, build_map, certain_part
+from crowdmap_torch.mapper import build_map, certain_part
 from crowdmap_torch.run_folder import read_survey_of, read_truth_of
-from crowdmap_torch.tables import Dataset
+from crowdmap_torch.tables import Association, Dataset
 
 COLUMNS = (
     ("pairs: precision", lambda f: f.association.pair_precision),
@@ -51,16 +51,16 @@ def compare(
             certain_part(result.hd_map, config.min_confidence),
             survey,
             truth=truth,
-            associations=sign_associations(dataset, result),
+            associations=sign_associations(dataset, result.associations),
         )
     return figures
 
 
-def sign_associations(dataset: Dataset, result: MapResult) -> SignAssociations:
+def sign_associations(dataset: Dataset, associations: Sequence[Association]) -> SignAssociations:
     """The rows of the journeys' signs files that a map has in a landmark, as its run folder would say."""
     number = torch.arange(len(dataset.journeys))
-    size = torch.tensor([len(a.sign) for a in result.associations])
-    landmark = torch.cat([a.sign for a in result.associations])
+    size = torch.tensor([len(a.sign) for a in associations])
+    landmark = torch.cat([a.sign for a in associations])
     used = landmark >= 0
     return SignAssociations(
         journey=torch.repeat_interleave(number, size)[used],

@@ -14,7 +14,7 @@ from crowdmap_torch.tables import Dataset
 
 
 def test_associations_are_those_of_the_result(tiny: Dataset, tiny_result: MapResult):
-    found = association.sign_associations(tiny, tiny_result)
+    found = association.sign_associations(tiny, tiny_result.associations)
     used = sum(int((a.sign >= 0).sum()) for a in tiny_result.associations)
     assert len(found.row) == used > 0
     for number, (journey, expected) in enumerate(

@@ -1,0 +1,109 @@
+"""Each idea beyond the paper switched off in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.studies.chapter import Chapter, Table
+from crowdmap_torch.studies.curves import plot_bars
+from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.numbers import numbers, results, spread
+from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
+from crowdmap_torch.studies.study import Settings, Study
+from crowdmap_torch.studies.tasks import MeasureMap, Task
+
+OURS = MapperConfig()
+
+
+def _without_drift(config: MapperConfig) -> MapperConfig:
+    fit = config.sign_triangulation.fit
+    # A hundredth of the usual drift is none.
+    still = replace(fit, drift=replace(fit.drift, scales=(0.01,)))
+    return replace(config, sign_triangulation=replace(config.sign_triangulation, fit=still))
+
+
+def _adjusted_with(**changes: float) -> MapperConfig:
+    return replace(OURS, adjust=replace(OURS.adjust, **changes))
+
+
+VARIANTS: Mapping[str, MapperConfig] = {
+    "ours": OURS,
+    "association by the epipolar cost alone": replace(
+        OURS,
+        sign_association=replace(OURS.sign_association, method="epipolar"),
+        lane_association=replace(OURS.lane_association, method="epipolar"),
+    ),
+    "signs without drift of the poses": _without_drift(OURS),
+    "road normal from calibration": replace(OURS, road=replace(OURS.road, method="calibration")),
+    "lanes on one plane a frame": replace(OURS, lane=replace(OURS.lane, method="paper2017")),
+    "clusters and biases of the paper": replace(
+        OURS, crowd=replace(OURS.crowd, method="paper2017")
+    ),
+    "biases from mean differences": replace(
+        OURS,
+        crowd=replace(OURS.crowd, align=replace(OURS.crowd.align, method="paper2017")),
+    ),
+    "nothing brought back": replace(OURS, harvest=replace(OURS.harvest, reach_m=0.0)),
+    "adjustment without drift": _adjusted_with(drift_spacing_m=1e6),
+    "adjustment without lanes": _adjusted_with(max_ground_distance_m=0.0),
+    "adjustment without Tukey": _adjusted_with(tukey_c=1e3),
+    "all of the paper": MapperConfig(method="paper2017"),
+}
+"""What is switched off, by what the configuration can say."""
+_NUMBERS = {
+    "relative [m]": "map.signs.relative.total.mean",
+    "absolute / oracle": "map.absolute_over_oracle",
+    "cluster heads, relative [m]": "heads.signs.relative.total.mean",
+    "sign recall": "map.signs.recall",
+    "sign precision": "map.signs.precision",
+    "data loss": "map.association.data_loss",
+    "lane recall": "map.lanes.recall",
+    "lane precision": "map.lanes.precision",
+    "lane lateral [m]": "map.lanes.lateral_without_shift.mean",
+    "lane width [m]": "map.lanes.width.mean",
+}
+
+
+def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
+    """A map for each variant and seed."""
+    for config in VARIANTS.values():
+        for task in _maps(settings.scale, config):
+            yield SHORT_TURNS * task.simulation.seed, task
+
+
+def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
+    """The figures of each variant."""
+    rows, bars = [], {}
+    for name, config in VARIANTS.items():
+        found = results(_maps(settings.scale, config), folder)
+        values = {title: spread(numbers(found, path)) for title, path in _NUMBERS.items()}
+        rows.append((name, *(value.mean for value in values.values()), len(found)))
+        relative, width = values["relative [m]"], values["lane width [m]"]
+        bars[name] = {
+            "relative corner error": (relative.mean, relative.std),
+            "lane width": (width.mean, width.std),
+        }
+    scale = settings.scale
+    return Chapter(
+        "ablation",
+        "Each idea switched off",
+        text=(
+            f"{scale.short_journeys} journeys of {scale.short_road.length_m:.0f} m; everything else stays ours. Means "
+            "over seeds, bars 1-sigma over them.",
+        ),
+        tables=(Table("ablation", ("without", *_NUMBERS, "seeds"), tuple(rows)),),
+        plots={"ablation": plot_bars(bars, x="mean error [m]")},
+    )
+
+
+def _maps(scale: Scale, config: MapperConfig) -> list[MeasureMap]:
+    return [
+        MeasureMap(scale.short_drives(seed), scale.short_journeys, config=config)
+        for seed in range(scale.short_seeds)
+    ]
+
+
+STUDY = Study("ablation", "Each idea switched off", tasks, chapter)
+add_arguments, run = STUDY.add_arguments, STUDY.run

@@ -1,0 +1,52 @@
+"""The maps that several studies look at: many drives on one road, by the number of journeys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.studies.scale import Scale
+from crowdmap_torch.studies.tasks import MeasureMap
+
+OURS = MapperConfig()
+PAPER = MapperConfig(method="paper2017")
+
+
+def our_maps(scale: Scale, count: int) -> list[MeasureMap]:
+    """Ours of `count` journeys, seed by seed, a few other journeys each time where they are few."""
+    if count == scale.journeys:
+        seeds = scale.seeds
+    else:
+        seeds = scale.curve_seeds if count < scale.journeys else scale.most_seeds
+    draws = min(scale.draws if count <= 2 else 1, scale.journeys // count or 1)
+    apart = scale.journeys // draws
+    return [
+        MeasureMap(scale.drives(seed), count, first=apart * draw)
+        for seed in range(seeds)
+        for draw in range(draws)
+    ]
+
+
+def paper_heads(scale: Scale, count: int, *, seeds: int | None = None) -> list[MeasureMap]:
+    """The cluster heads of the paper's method, of the same signs; its lanes have no part in them.
+
+    Of a single journey it has none: singletons are discarded.
+    """
+    if seeds is None:
+        seeds = scale.curve_seeds if count != scale.journeys else scale.preset_seeds
+    return [
+        MeasureMap(scale.drives(seed, lanes=False), count, config=PAPER, adjusted=False)
+        for seed in range(seeds)
+    ]
+
+
+def in_turns(scale: Scale, maps: Iterable[MeasureMap]) -> Iterator[tuple[int, MeasureMap]]:
+    """Each with its turn: seed after seed, those at the number of journeys that counts twice as fast as the others.
+
+    Those of the most journeys take as long as all the others of a seed, and come last of the curves.
+    """
+    for task in maps:
+        if task.count > scale.journeys:
+            yield 2 * scale.curve_seeds + task.simulation.seed, task
+        else:
+            yield task.simulation.seed * (1 if task.count == scale.journeys else 2), task

@@ -1,0 +1,117 @@
+"""How much is simulated: the whole study, or a quick look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from crowdmap_torch.simulate import POSITIONING_PRESETS, WORLD_PRESETS, SimulationConfig
+from crowdmap_torch.simulate.rigs import RigConfig
+from crowdmap_torch.simulate.vehicle import VehicleConfig
+from crowdmap_torch.simulate.worlds import WorldConfig
+
+SHORT_TURNS = 4
+"""Turns between the seeds of studies on the short road: many maps of little weight."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Roads, numbers of journeys and seeds of the studies."""
+
+    road: WorldConfig = field(default_factory=lambda: WORLD_PRESETS["suburb"])
+    """Where the paper's figures are drawn."""
+    short_road: WorldConfig = field(
+        default_factory=lambda: replace(WORLD_PRESETS["suburb"], length_m=400.0)
+    )
+    """Where one thing after another is varied: many maps of it are made."""
+    vehicle: VehicleConfig = field(default_factory=VehicleConfig)
+    rig: RigConfig = field(default_factory=RigConfig)
+    counts: tuple[int, ...] = (1, 2, 5, 10, 15, 25, 50)
+    """Numbers of journeys of a curve."""
+    journeys: int = 25
+    """The number that figures are compared at."""
+    short_journeys: int = 10
+    """Journeys on the short road."""
+    seeds: int = 10
+    """Worlds and fleets at `journeys`."""
+    curve_seeds: int = 5
+    """Those of them that fewer journeys are mapped of."""
+    most_seeds: int = 2
+    """Those that more journeys are mapped of."""
+    preset_seeds: int = 20
+    """On which a positioning preset is judged."""
+    other_preset_seeds: int = 5
+    """For each of the presets beside it."""
+    short_seeds: int = 3
+    """On the short road."""
+    draws: int = 3
+    """Most maps of one or two journeys of a dataset, other journeys each time."""
+    noise_steps: int = 3
+    """Steps of each sweep, beside the default."""
+    faults: int | None = None
+    """Kinds of bad drives; None: all."""
+
+    def drives(self, seed: int, *, positioning: str = "paper", lanes: bool = True):
+        """The drives on the road; without `lanes` nothing but signs was detected, the same as with them."""
+        most = max(self.counts) if seed < self.most_seeds else self.journeys
+        simulation = SimulationConfig(
+            world=self.road,
+            vehicle=self.vehicle,
+            rig=self.rig,
+            positioning=POSITIONING_PRESETS[positioning],
+            journeys=most,
+            seed=seed,
+        )
+        return simulation if lanes else without_lanes(simulation)
+
+    def short_drives(self, seed: int) -> SimulationConfig:
+        """The drives on the short road."""
+        return SimulationConfig(
+            world=self.short_road,
+            vehicle=self.vehicle,
+            rig=self.rig,
+            journeys=self.short_journeys,
+            seed=seed,
+        )
+
+    def curve_counts(self, seed: int) -> tuple[int, ...]:
+        """Of how many journeys maps are made in a world."""
+        if seed < self.most_seeds:
+            return self.counts
+        return tuple(n for n in self.counts if n <= self.journeys)
+
+
+def without_lanes(simulation: SimulationConfig) -> SimulationConfig:
+    """The same drives, their lane detector switched off."""
+    return replace(simulation, lanes=replace(simulation.lanes, max_lanes=0))
+
+
+FULL = Scale()
+QUICK = Scale(
+    road=replace(
+        WORLD_PRESETS["street"],
+        length_m=120.0,
+        lights_per_km=0.0,
+        signs=replace(WORLD_PRESETS["street"].signs, posts_per_km=60.0),
+    ),
+    short_road=replace(
+        WORLD_PRESETS["street"],
+        length_m=80.0,
+        lights_per_km=0.0,
+        signs=replace(WORLD_PRESETS["street"].signs, posts_per_km=60.0),
+    ),
+    vehicle=VehicleConfig(frame_rate_hz=6.0),
+    rig=RigConfig(camera="pinhole"),
+    counts=(1, 2, 4),
+    journeys=4,
+    short_journeys=3,
+    seeds=1,
+    curve_seeds=1,
+    most_seeds=0,
+    preset_seeds=1,
+    other_preset_seeds=1,
+    short_seeds=1,
+    draws=1,
+    noise_steps=1,
+    faults=2,
+)
+"""A street of a few houses; its figures say that everything runs, nothing else."""

@@ -1,0 +1,79 @@
+"""A study: the work that it asks for, and the chapter that it draws from what is done."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crowdmap_torch.studies.chapter import Chapter, write_chapters
+from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.scale import FULL, QUICK, Scale
+from crowdmap_torch.studies.tasks import Task, open_tasks, run_tasks
+
+INTERRUPTED = "stopped; what is done is kept, and the same command goes on from there"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command line says of a study."""
+
+    scale: Scale
+    real: Path | None
+    """Folder of real drives."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """A module of this package is run by its `add_arguments` and `run`; those of a study are these methods."""
+
+    name: str
+    title: str
+    tasks: Callable[[Settings], Iterable[tuple[int, Task]]]
+    """Each with its turn, lower ones first: the seed as a rule, so that studies that are stopped all have something to
+    show."""
+    chapter: Callable[[Settings, StudyFolder], Chapter]
+    """Drawn from what is done, whatever that is."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Where, how much, and how many at a time."""
+        add_arguments(parser)
+
+    def run(self, options: argparse.Namespace) -> None:
+        """Does what is not done yet and writes the page."""
+        run_studies(self.name, (self,), options)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What every study takes."""
+    parser.add_argument("--out", type=Path, default=Path("study"), help="folder of all results")
+    parser.add_argument(
+        "--quick", action="store_true", help="a tiny world: only shows that it runs"
+    )
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="N")
+    parser.add_argument("--real", type=Path, metavar="DIR", help="folder of kitti-signs")
+    parser.add_argument(
+        "--report-only", action="store_true", help="tables and plots of what is done, no more work"
+    )
+
+
+def run_studies(name: str, studies: Sequence[Study], options: argparse.Namespace) -> None:
+    """Does what is not done yet of all studies, seed after seed, and writes one page."""
+    settings = Settings(QUICK if options.quick else FULL, options.real)
+    folder = StudyFolder(options.out / "quick" if options.quick else options.out)
+    turns = [turn for study in studies for turn in study.tasks(settings)]
+    tasks = [task for _, task in sorted(turns, key=lambda turn: turn[0])]
+    if not options.report_only:
+        try:
+            run_tasks(tasks, folder, processes=options.processes)
+        except KeyboardInterrupt:
+            sys.stderr.write(f"\n{INTERRUPTED}\n")
+    chapters = [study.chapter(settings, folder) for study in studies]
+    title = studies[0].title if len(studies) == 1 else "Studies"
+    print(write_chapters(folder.path, name, title, chapters))
+    left = len(open_tasks(tasks, folder))
+    if left:
+        print(f"{left} pieces of work are not done yet")

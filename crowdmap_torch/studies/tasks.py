@@ -1,0 +1,318 @@
+"""The work of studies in pieces: each is done once, says what it needs, and leaves one file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+from signal import SIG_DFL, SIGINT, signal
+from typing import Protocol
+
+import torch
+
+from crowdmap_torch.config import MapperConfig, config_hash
+from crowdmap_torch.evaluate import evaluate_map
+from crowdmap_torch.evaluation.evidence import named_in, read_observable_ids
+from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.mapper import JourneyMap, build_map, certain_part, map_journey
+from crowdmap_torch.report.progress import Progress
+from crowdmap_torch.simulate import SimulationConfig, write_dataset
+from crowdmap_torch.studies.folder import StudyFolder, dataset_name, digest, journey_config_hash
+from crowdmap_torch.studies.measure import load_drives, measure_journey, measure_map
+
+_STAGE = "studies, seconds of work"
+
+
+class Task(Protocol):
+    """A piece of work."""
+
+    @property
+    def key(self) -> str:
+        """Differs where what is left behind differs."""
+        ...
+
+    @property
+    def cost_s(self) -> float:
+        """About how many seconds of a core it takes; for the time that is left, nothing else."""
+        ...
+
+    def needs(self) -> Sequence[Task]:
+        """What must be done before."""
+        ...
+
+    def is_done(self, folder: StudyFolder) -> bool:
+        """True if it need not be done again."""
+        ...
+
+    def run(self, folder: StudyFolder) -> None:
+        """Does it."""
+        ...
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """A dataset."""
+
+    simulation: SimulationConfig
+
+    @property
+    def key(self) -> str:
+        """The dataset's name."""
+        return dataset_name(self.simulation)
+
+    @property
+    def cost_s(self) -> float:
+        """Of all its journeys."""
+        return 0.3 * _kilometres(self.simulation, self.simulation.journeys)
+
+    def needs(self) -> Sequence[Task]:
+        """Nothing."""
+        return ()
+
+    def is_done(self, folder: StudyFolder) -> bool:
+        """True if the dataset is there: it is written as a whole."""
+        return folder.dataset(self.simulation).exists()
+
+    def run(self, folder: StudyFolder) -> None:
+        """Writes it."""
+        write_dataset(self.simulation, folder.dataset(self.simulation))
+
+
+@dataclass(frozen=True)
+class MapJourney:
+    """The map of one journey, and what it is worth."""
+
+    simulation: SimulationConfig
+    row: int
+    """Number of the journey in its dataset."""
+    config: MapperConfig = field(default_factory=MapperConfig)
+
+    @property
+    def key(self) -> str:
+        """Of the dataset, the journey and what the configuration says of single journeys."""
+        name, settings = dataset_name(self.simulation), journey_config_hash(self.config)
+        return f"{name}-{self.row:03d}-{settings}"
+
+    @property
+    def cost_s(self) -> float:
+        """Of one journey."""
+        return 4.5 * _kilometres(self.simulation, 1)
+
+    def needs(self) -> Sequence[Task]:
+        """The dataset."""
+        return (Simulate(self.simulation),)
+
+    def is_done(self, folder: StudyFolder) -> bool:
+        """True if it was measured, which comes last."""
+        return folder.has_result(self.key)
+
+    def run(self, folder: StudyFolder) -> None:
+        """Maps the journey and measures the map."""
+        drives = load_drives(folder.dataset(self.simulation))
+        begun = time.process_time()
+        made = map_journey(drives.dataset.journeys[self.row], 0, self.config)
+        seconds = time.process_time() - begun
+        folder.write_journey_map(self.key, made)
+        measured = measure_journey(drives, self.row, made)
+        folder.write_result(self.key, {**measured, "seconds": seconds})
+
+
+@dataclass(frozen=True)
+class MeasureMap:
+    """What the map of some journeys of a dataset is worth."""
+
+    simulation: SimulationConfig
+    count: int
+    first: int = 0
+    """The first of these journeys."""
+    config: MapperConfig = field(default_factory=MapperConfig)
+    adjusted: bool = True
+    """False: the cluster heads alone."""
+    control: int = 0
+    """Surveyed signs that pin the map."""
+
+    @property
+    def key(self) -> str:
+        """Of all the fields."""
+        settings = {
+            "config": config_hash(self.config),
+            "adjusted": self.adjusted,
+            "control": self.control,
+        }
+        name = dataset_name(self.simulation)
+        return f"{name}-{self.first}+{self.count}-{digest(settings)}"
+
+    @property
+    def cost_s(self) -> float:
+        """Of all the journeys together."""
+        driven = _kilometres(self.simulation, self.count)
+        return 2.0 + (2.5 if self.adjusted else 0.6) * driven
+
+    @property
+    def rows(self) -> range:
+        """The journeys."""
+        return range(self.first, self.first + self.count)
+
+    def journeys(self) -> tuple[MapJourney, ...]:
+        """The maps of the single journeys."""
+        return tuple(MapJourney(self.simulation, row, self.config) for row in self.rows)
+
+    def needs(self) -> Sequence[Task]:
+        """The single journeys, and the dataset should it have been removed."""
+        return (Simulate(self.simulation), *self.journeys())
+
+    def is_done(self, folder: StudyFolder) -> bool:
+        """True if it was measured."""
+        return folder.has_result(self.key)
+
+    def run(self, folder: StudyFolder) -> None:
+        """Maps the journeys together and measures the map."""
+        drives = load_drives(folder.dataset(self.simulation)).select(self.rows)
+        maps = [
+            _numbered(folder.read_journey_map(journey.key), number)
+            for number, journey in enumerate(self.journeys())
+        ]
+        measured = measure_map(
+            drives, maps, self.config, adjusted=self.adjusted, control=self.control
+        )
+        folder.write_result(self.key, measured)
+
+
+@dataclass(frozen=True)
+class MeasureReal:
+    """What the map of a real drive is worth, against positions that were measured."""
+
+    dataset: Path
+    eligible: Path
+    """JSON with the ids of the surveyed signs that can be seen."""
+    gate_m: float
+    config: MapperConfig = field(default_factory=MapperConfig)
+
+    @property
+    def key(self) -> str:
+        """Of the name of the drive and the settings."""
+        settings = {"config": config_hash(self.config), "gate_m": self.gate_m}
+        return f"real-{self.dataset.name}-{digest(settings)}"
+
+    @property
+    def cost_s(self) -> float:
+        """Of a drive of a few minutes."""
+        return 20.0
+
+    def needs(self) -> Sequence[Task]:
+        """Nothing."""
+        return ()
+
+    def is_done(self, folder: StudyFolder) -> bool:
+        """True if it was measured."""
+        return folder.has_result(self.key)
+
+    def run(self, folder: StudyFolder) -> None:
+        """Maps the drive and measures the map."""
+        dataset = load_dataset(self.dataset)
+        survey = read_survey(self.dataset / "survey")
+        begun = time.process_time()
+        result = build_map(dataset, self.config)
+        seconds = time.process_time() - begun
+        alone = replace(result.hd_map, signs=result.journey_maps[0].signs)
+        final = certain_part(result.hd_map, self.config.min_confidence)
+        ids = named_in(survey, read_observable_ids(self.eligible))
+        measured = {
+            name: evaluate_map(hd_map, survey, observable_ids=ids, gate_m=self.gate_m).as_dict()
+            for name, hd_map in (("journey", alone), ("map", final))
+        }
+        frames = sum(journey.frame_count for journey in dataset.journeys)
+        folder.write_result(self.key, {**measured, "frames": frames, "seconds": seconds})
+
+
+def open_tasks(tasks: Sequence[Task], folder: StudyFolder) -> list[Task]:
+    """What is not done yet of `tasks` and of all that they need, each once, needs first."""
+    found: dict[str, Task] = {}
+    seen: set[str] = set()
+
+    def visit(task: Task) -> None:
+        if task.key in seen:
+            return
+        seen.add(task.key)
+        if task.is_done(folder):
+            return
+        for need in task.needs():
+            visit(need)
+        found[task.key] = task
+
+    for task in tasks:
+        visit(task)
+    return list(found.values())
+
+
+def run_tasks(
+    tasks: Sequence[Task],
+    folder: StudyFolder,
+    *,
+    processes: int = 1,
+    progress: Progress | None = None,
+) -> None:
+    """Does what is not done yet, `processes` at a time, each on one core, in the order given as far as needs allow.
+
+    What is finished stays finished, whenever this is interrupted.
+    """
+    waiting = {task.key: task for task in open_tasks(tasks, folder)}
+    needs = {key: {need.key for need in task.needs()} for key, task in waiting.items()}
+    total, done = sum(task.cost_s for task in waiting.values()), 0.0
+    progress = progress or Progress()
+
+    def tell(task: Task) -> None:
+        nonlocal done
+        done += task.cost_s
+        progress(_STAGE, round(done), max(round(total), 1), task.key)
+
+    if processes <= 1:
+        _use_one_core()
+        for task in waiting.values():
+            task.run(folder)
+            tell(task)
+        progress.finish()
+        return
+    with ProcessPoolExecutor(
+        processes, mp_context=get_context("spawn"), initializer=_begin_worker
+    ) as pool:
+        running: dict[Future[None], Task] = {}
+        try:
+            while waiting or running:
+                unfinished = waiting.keys() | {task.key for task in running.values()}
+                ready = [key for key in waiting if not needs[key] & unfinished]
+                for key in ready[: processes - len(running)]:
+                    task = waiting.pop(key)
+                    running[pool.submit(task.run, folder)] = task
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    task = running.pop(future)
+                    future.result()
+                    tell(task)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+    progress.finish()
+
+
+def _begin_worker() -> None:
+    # Ctrl-C ends a worker at once; files are written beside their place and renamed.
+    signal(SIGINT, SIG_DFL)
+    _use_one_core()
+
+
+def _use_one_core() -> None:
+    torch.set_num_threads(1)
+
+
+def _numbered(made: JourneyMap, number: int) -> JourneyMap:
+    """The map of the `number`-th journey of those that are mapped together."""
+    signs = replace(made.signs, journey=torch.full_like(made.signs.journey, number))
+    lanes = replace(made.lanes, journey=torch.full_like(made.lanes.journey, number))
+    return replace(made, signs=signs, lanes=lanes)
+
+
+def _kilometres(simulation: SimulationConfig, journeys: int) -> float:
+    return journeys * simulation.world.length_m / 1000
