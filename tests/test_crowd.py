@@ -12,6 +12,7 @@ from crowdmap_torch.clustering.spectral import same_partition
 from crowdmap_torch.crowd import CrowdConfig, associate_crowd, unbiased_signs
 from crowdmap_torch.crowd_signs import pairs_seen_together
 from crowdmap_torch.similarity import mahalanobis
+from crowdmap_torch.stages.cluster import moved
 from crowdmap_torch.stages.existence import ExistenceConfig, existence
 from crowdmap_torch.stages.suspects import SuspectConfig, suspect_journeys
 
@@ -196,6 +197,24 @@ def test_no_signs_at_all_are_an_empty_crowd():
     for method in ("joint", "paper2017"):
         found = associate_crowd(empty, CrowdConfig(method=method))
         assert len(found.heads) == len(found.tentative) == 0
+
+
+def test_journeys_that_share_nothing_have_tentative_signs_only():
+    world = make_world(14, journeys=3)
+    crowd, signs = world.crowd, world.crowd.signs
+    far = torch.tensor([5000.0, 0.0, 0.0], dtype=torch.float64)
+    path = crowd.path_position + crowd.path_journey[:, None] * far
+    apart = replace(
+        crowd,
+        signs=moved(signs, signs.journey[:, None] * far),
+        view_position=crowd.view_position + signs.journey[:, None] * far,
+        path_position=path,
+    )
+    for method in ("joint", "paper2017"):
+        found = associate_crowd(apart, CrowdConfig(method=method))
+        assert len(found.heads) == 0
+        assert len(found.tentative) == len(signs)
+        assert bool((found.bias.translation.abs() < 1e-6).all())
 
 
 def test_pairs_seen_together_are_beside_each_other_in_a_frame():

@@ -143,6 +143,17 @@ def test_progress_is_told_every_journey_and_every_step(tiny: Dataset):
     assert steps == list(range(1, len(steps) + 1)) and steps
 
 
+def test_signs_of_journeys_that_share_nothing_are_tentative(tiny: Dataset):
+    far = torch.tensor([5000.0, 0.0, 0.0], dtype=torch.float64)
+    first, second = (with_frames(j, torch.arange(0, 60, 2)) for j in tiny.journeys[:2])
+    T = second.T_world_camera.clone()
+    T[:, :3, 3] += far
+    journeys = (first, replace(second, T_world_camera=T))
+    result = build_map(replace(tiny, journeys=journeys), CONFIG)
+    assert len(certain_part(result.hd_map, CONFIG.min_confidence).signs) == 0
+    assert result.hd_map.signs.journey.unique().tolist() == [0, 1]
+
+
 def test_inputs_are_left_as_they_were(tiny: Dataset):
     journey = with_frames(tiny.journeys[1], torch.arange(0, 60, 3))
     kept = [

@@ -351,9 +351,8 @@ def _guide(
 ) -> _Guide:
     """How the projection of each sight errs, between the nearest detections of its sign before and after."""
     detections = journey.signs
-    known = association.sign >= 0
-    known &= detections.shape == signs.shape[association.sign.clamp_min(0)]
-    rows = torch.nonzero(known)[:, 0]
+    rows = torch.nonzero(association.sign >= 0)[:, 0]
+    rows = rows[detections.shape[rows] == signs.shape[association.sign[rows]]]
     sign = association.sign[rows]
     px, _ = _projected(journey, pose[detections.frame[rows]], signs, sign)
     count = polygon.corner_count(signs.shape[sign])

@@ -125,6 +125,8 @@ def join_passes(
     They are a sign seen from afar, when the direction it faces is ambiguous, and from nearby.
     """
     pair = near_pairs(heads.center_world, radius=config.alone_m, count=config.candidates)
+    if not len(pair):
+        return label
     number = heads.n_journeys[pair]
     pair = torch.where((number[:, 0] > number[:, 1])[:, None], pair.flip(1), pair)  # weaker first
     a, b = pair.T

@@ -191,6 +191,12 @@ def test_a_journey_without_detections_is_left_alone(drive: SignDrive):
     assert len(found.associations[0].sign) == 0 and found.fitting == found.strays == 0
 
 
+def test_a_map_of_nothing_takes_nothing(drive: SignDrive):
+    known = torch.zeros(len(drive.sign), dtype=torch.bool)
+    found = harvested(drive, known, drive.sign, signs=map_of(drive)[:0])
+    assert bool((found.sign == -1).all())
+
+
 def two_journeys(drive: SignDrive, second: Tensor) -> tuple[list, list, list[Association]]:
     """The drive twice; `second` is the sign of each detection of the other journey."""
     known = torch.ones(len(drive.sign), dtype=torch.bool)
