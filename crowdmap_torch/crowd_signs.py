@@ -150,7 +150,11 @@ def pairs_seen_together(
 
 
 def largest_leap(journey: Journey) -> Float[Tensor, ""]:
-    """Largest step [m] beyond what the steps before and behind it, and a car's brakes and tyres, explain."""
+    """Largest step [m] beyond what the steps before and behind it, and a car's brakes and tyres, explain.
+
+    By their times or by their lengths: times say why the step over a gap in the frames is long, lengths that a step is
+    like the others whatever its times.
+    """
     position = journey.T_world_camera[:, :3, 3]
     step = position.diff(dim=0)
     seconds = journey.t_ns.diff().to(step) * 1e-9
@@ -159,12 +163,18 @@ def largest_leap(journey: Journey) -> Float[Tensor, ""]:
     velocity = step / seconds[:, None]
     # The speed of a step is that of its middle: from there to the next step's middle it may change.
     change = _HARDEST_MPS2 * (seconds[1:] + seconds[:-1]) / 2
-    apart = (velocity[1:] - velocity[:-1]).norm(dim=1)
-    beyond = (apart - change).clamp_min(0)
-    # A leap stands out against both of its neighbours, a car that pulls away after one does not.
-    none = beyond.new_full((1,), torch.inf)
-    either = torch.minimum(torch.cat((none, beyond)), torch.cat((beyond, none)))
-    return (either * seconds).max()
+    faster = (velocity.diff(dim=0).norm(dim=1) - change).clamp_min(0)
+    by_time = _against_both(faster) * seconds
+    return torch.minimum(by_time, _against_both(step.diff(dim=0).norm(dim=1))).max()
+
+
+def _against_both(change: Float[Tensor, " f"]) -> Float[Tensor, " g"]:
+    """The lesser of a step's changes from the step before and to the one behind it.
+
+    A leap stands out against both of its neighbours, a car that pulls away after one does not.
+    """
+    none = change.new_full((1,), torch.inf)
+    return torch.minimum(torch.cat((none, change)), torch.cat((change, none)))
 
 
 def with_covariance(signs: Signs, extra: Float[Tensor, "n 3 3"]) -> Signs:

@@ -39,6 +39,18 @@ def test_a_gap_in_the_frames_is_no_leap(tiny: Dataset):
     assert float(largest_leap(gapped)) < 0.5
 
 
+def test_times_that_jitter_are_no_leap(tiny: Dataset, generator: torch.Generator):
+    journey = tiny.journeys[0]
+    late = 1e8 * torch.rand(journey.frame_count, generator=generator, dtype=torch.float64)
+    # Still one after the other, some of them a millisecond apart.
+    t_ns = (journey.t_ns + late.long()).cummax(0)[0] + 10**6 * torch.arange(journey.frame_count)
+    jittered = replace(journey, t_ns=t_ns)
+    assert float(largest_leap(jittered)) < 0.5
+    jump = moved(jittered, journey.frame_count // 2, [8.0, 0.0, 0.0])
+    # Of a step that seems to have taken a tenth of a second more, brakes explain more.
+    assert float(largest_leap(jump)) == pytest.approx(8.0, abs=1.5)
+
+
 def test_one_or_two_frames_do_not_leap(tiny: Dataset):
     journey = tiny.journeys[0]
     for count in (0, 1, 2):
