@@ -30,7 +30,7 @@ def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """A map for each fault and seed, and one without any."""
     for kind in _kinds(settings.scale):
         for task in _maps(settings.scale, kind):
-            yield SHORT_TURNS * task.simulation.seed, task
+            yield 4 + SHORT_TURNS * task.simulation.seed, task
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:

@@ -92,7 +92,7 @@ def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     for sweep in SWEEPS.values():
         for value in _values(settings.scale, sweep):
             for task in _maps(settings.scale, sweep, value):
-                yield SHORT_TURNS * task.simulation.seed, task
+                yield 4 + SHORT_TURNS * task.simulation.seed, task
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:

@@ -49,7 +49,7 @@ def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """A map for each variant and seed."""
     for config in VARIANTS.values():
         for task in _maps(settings.scale, config):
-            yield SHORT_TURNS * task.simulation.seed, task
+            yield 2 + SHORT_TURNS * task.simulation.seed, task
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:

@@ -10,7 +10,8 @@ from crowdmap_torch.simulate.vehicle import VehicleConfig
 from crowdmap_torch.simulate.worlds import WorldConfig
 
 SHORT_TURNS = 4
-"""Turns between the seeds of studies on the short road: many maps of little weight."""
+"""Turns between the seeds of studies on the short road: many maps of little weight, which wait for the first seeds of
+the others."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Scale:
     road: WorldConfig = field(default_factory=lambda: WORLD_PRESETS["suburb"])
     """Where the paper's figures are drawn."""
     short_road: WorldConfig = field(
-        default_factory=lambda: replace(WORLD_PRESETS["suburb"], length_m=400.0)
+        default_factory=lambda: replace(WORLD_PRESETS["suburb"], length_m=300.0)
     )
     """Where one thing after another is varied: many maps of it are made."""
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
@@ -29,7 +30,7 @@ class Scale:
     """Numbers of journeys of a curve."""
     journeys: int = 25
     """The number that figures are compared at."""
-    short_journeys: int = 10
+    short_journeys: int = 8
     """Journeys on the short road."""
     seeds: int = 10
     """Worlds and fleets at `journeys`."""
@@ -89,21 +90,21 @@ FULL = Scale()
 QUICK = Scale(
     road=replace(
         WORLD_PRESETS["street"],
-        length_m=120.0,
+        length_m=100.0,
         lights_per_km=0.0,
         signs=replace(WORLD_PRESETS["street"].signs, posts_per_km=60.0),
     ),
     short_road=replace(
         WORLD_PRESETS["street"],
-        length_m=80.0,
+        length_m=60.0,
         lights_per_km=0.0,
         signs=replace(WORLD_PRESETS["street"].signs, posts_per_km=60.0),
     ),
-    vehicle=VehicleConfig(frame_rate_hz=6.0),
+    vehicle=VehicleConfig(frame_rate_hz=5.0),
     rig=RigConfig(camera="pinhole"),
-    counts=(1, 2, 4),
-    journeys=4,
-    short_journeys=3,
+    counts=(1, 3),
+    journeys=3,
+    short_journeys=2,
     seeds=1,
     curve_seeds=1,
     most_seeds=0,

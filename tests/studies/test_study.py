@@ -1,0 +1,154 @@
+"""The whole of `study.py all --quick`, once: every study runs, draws, and finds its work done the second time."""
+
+from __future__ import annotations
+
+import csv
+import runpy
+from collections.abc import Callable
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from crowdmap_torch.studies import all as every
+from crowdmap_torch.studies.scale import QUICK
+from crowdmap_torch.studies.study import Settings
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "study.py"
+DRAWN = {study.name for study in every.STUDIES} - {"real"}
+
+Main = Callable[[list[str]], int]
+
+
+@dataclass(frozen=True)
+class Quick:
+    """What `study.py all --quick` left."""
+
+    out: Path
+    code: int
+
+    @property
+    def folder(self) -> Path:
+        return self.out / "quick"
+
+    def arguments(self, name: str = "all") -> list[str]:
+        return [name, "--quick", "--out", str(self.out), "--processes", "1"]
+
+
+class Sections(HTMLParser):
+    """The anchors of a page, and where its links lead."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ids: set[str] = set()
+        self.links: set[str] = set()
+
+    def handle_starttag(self, tag, attrs) -> None:
+        named = {name: value or "" for name, value in attrs}
+        if tag == "section":
+            self.ids.add(named["id"])
+        if named.get("href", "").startswith("#"):
+            self.links.add(named["href"][1:])
+
+
+@pytest.fixture(scope="module")
+def main() -> Main:
+    return runpy.run_path(str(SCRIPT))["main"]
+
+
+@pytest.fixture(scope="module")
+def quick(main: Main, tmp_path_factory: pytest.TempPathFactory) -> Quick:
+    """The quick form, run once for all tests: under a minute of one core."""
+    out = tmp_path_factory.mktemp("study")
+    asked = Quick(out, -1)
+    return Quick(out, main(asked.arguments()))
+
+
+def test_the_page_has_a_section_for_every_study(quick: Quick):
+    assert quick.code == 0
+    page = Sections()
+    page.feed((quick.folder / "all.html").read_text(encoding="utf-8"))
+    assert page.ids == page.links == {study.name for study in every.STUDIES}
+
+
+def test_every_study_has_a_table_and_a_plot(quick: Quick):
+    for name in DRAWN:
+        with (quick.folder / "tables" / f"{name}.csv").open(encoding="utf-8") as file:
+            heading, *rows = csv.reader(file)
+        assert rows, name
+        assert all(len(row) == len(heading) for row in rows), name
+        assert (quick.folder / "plots" / f"{name}.png").read_bytes().startswith(b"\x89PNG"), name
+
+
+def test_our_map_of_the_quick_street_is_near_the_oracle(quick: Quick):
+    with (quick.folder / "tables" / "journeys-targets.csv").open(encoding="utf-8") as file:
+        mean = {row[""]: row["mean"] for row in csv.DictReader(file)}
+    # Three journeys on a short street: their mean pose error is about 0.3 m.
+    assert 0.5 < float(mean["absolute / oracle"]) < 1.5
+    assert float(mean["relative error [m]"]) < 0.1
+    assert float(mean["sign recall"]) == 1
+
+
+def test_what_is_done_is_not_done_again(quick: Quick, main: Main, capsys: pytest.CaptureFixture):
+    results = sorted((quick.folder / "results").iterdir())
+    before = [path.stat().st_mtime_ns for path in results]
+    assert main(quick.arguments("control")) == 0
+    assert [path.stat().st_mtime_ns for path in results] == before
+    assert "not done yet" not in capsys.readouterr().out
+
+
+def test_a_lost_result_alone_is_made_again(quick: Quick, main: Main):
+    lost = _a_map(quick)
+    before = {p.name: p.stat().st_mtime_ns for p in (quick.folder / "results").iterdir()}
+    lost.unlink()
+    assert main(quick.arguments("journeys")) == 0
+    after = {p.name: p.stat().st_mtime_ns for p in (quick.folder / "results").iterdir()}
+    assert {name for name in before if after[name] != before[name]} == {lost.name}
+    assert (quick.folder / "journeys.html").exists()
+
+
+def test_the_report_of_a_study_that_has_not_begun_is_empty_but_there(
+    main: Main, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    assert main(["all", "--quick", "--out", str(tmp_path), "--report-only"]) == 0
+    said = capsys.readouterr().out
+    assert (tmp_path / "quick" / "all.html").exists()
+    assert "not done yet" in said
+
+
+def test_a_folder_without_real_drives_is_wrong_input(
+    main: Main, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    out = tmp_path / "out"
+    code = main(["real", "--quick", "--out", str(out), "--real", str(tmp_path)])
+    assert code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("study.py: ") and error.count("\n") == 1
+
+
+def test_real_drives_are_skipped_with_a_reason(main: Main, tmp_path: Path):
+    assert main(["real", "--quick", "--out", str(tmp_path), "--processes", "1"]) == 0
+    assert "--real DIR" in (tmp_path / "quick" / "real.html").read_text(encoding="utf-8")
+
+
+def test_real_drives_make_a_table(main: Main, tmp_path: Path, real_data: Callable[[str], Path]):
+    kitti = real_data("kitti-signs")
+    chosen = tmp_path / "drives"
+    chosen.mkdir()
+    (chosen / "kitti-06").symlink_to(kitti / "kitti-06")
+    (chosen / "eligible.json").symlink_to(kitti / "eligible.json")
+    arguments = ["--quick", "--out", str(tmp_path / "out"), "--processes", "1"]
+    assert main(["real", *arguments, "--real", str(chosen)]) == 0
+    with (tmp_path / "out" / "quick" / "tables" / "real.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    ours = next(row for row in rows if row["method"] == "ours")
+    assert ours["eligible"] == ours["mapped"] == "2"
+    assert 0 < float(ours["mean [m]"]) < 1
+
+
+def _a_map(quick: Quick) -> Path:
+    settings = Settings(QUICK, None)
+    study = next(study for study in every.STUDIES if study.name == "journeys")
+    task = next(task for _, task in study.tasks(settings) if "+3-" in task.key)
+    return quick.folder / "results" / f"{task.key}.json"
