@@ -358,7 +358,8 @@ def _sign_association(
     row_of_tracklet[members.tracklet[mine]] = mine
     # Label -1 reads the last slot, which stays -1.
     member = row_of_tracklet[tracklets.label]
-    head = torch.where(member >= 0, crowd.label[member.clamp_min(0)], -1)
+    found = torch.nonzero(member >= 0)[:, 0]
+    head = torch.full_like(tracklets.label, -1).index_put((found,), crowd.label[member[found]])
     used = torch.nonzero(head >= 0)[:, 0]
     shift = torch.zeros_like(head)
     of_member, of_head = members[member[used]], crowd.heads[head[used]]
