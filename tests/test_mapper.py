@@ -168,9 +168,9 @@ def test_inputs_are_left_as_they_were(tiny: Dataset):
 
 @pytest.mark.parametrize("method", ["joint", "paper2017"])
 def test_detections_that_make_no_sign_give_a_map_without_signs(tiny: Dataset, method: str):
-    one = torch.zeros(1, dtype=torch.int64)
+    one, none = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
     journeys = tuple(
-        replace(j, signs=j.signs[one], lanes=j.lanes[:0], lane_points=j.lane_points[:0])
+        replace(j, signs=j.signs[one], lanes=j.lanes[none], lane_points=j.lane_points[none])
         for j in tiny.journeys
     )
     result = build_map(replace(tiny, journeys=journeys), MapperConfig(method=method))
