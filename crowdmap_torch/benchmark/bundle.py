@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,14 @@ LM = lm.LmConfig(
 )
 """Both stages stop when a step lowers the cost by less than a millionth, as the peers do."""
 PEERS = {"ceres": "peers/ceres.py", "gtsam": "peers/gtsam.py"}
-SERIES = ((5, 100, 10), (25, 500, 31), (100, 500, 31), (25, 500, 200), (400, 500, 31))
+SERIES = (
+    (5, 100, 10),
+    (5, 500, 31),
+    (25, 500, 31),
+    (100, 500, 31),
+    (400, 500, 31),
+    (25, 500, 200),
+)
 """Journeys, frames of each and signs of the problems of the table."""
 
 
@@ -65,8 +73,9 @@ def run(options: argparse.Namespace) -> None:
         return
     print(f"{'size':>14} {'corners':>9} {'solver':>7} {'setup':>8} {'solve':>8} {'steps':>6} "
           f"{'memory':>8} {'cost':>16}")  # fmt: skip
-    for size in options.sizes:
-        _race(size, options)
+    medians = {size: _race(size, options) for size in options.sizes}
+    for line in growth(medians):
+        print(line)
 
 
 def solve_file(problem: Path, out: Path | None, device: torch.device) -> dict[str, Any]:
@@ -139,13 +148,43 @@ def _peak_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
-def _race(size: str, options: argparse.Namespace) -> None:
-    """All solvers on one size, in turns, each in a fresh process; a line of medians for each."""
+def growth(medians: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Iterator[str]:
+    """Exponents of time and memory in the number of journeys, for roads of which three sizes or more were solved.
+
+    `medians` has by size and solver what `solve_file` gives. The exponents are slopes of straight lines through the
+    logarithms.
+    """
+    runs: dict[tuple[str, tuple[int, ...]], list[tuple[int, Mapping[str, float]]]] = {}
+    for size, by_solver in medians.items():
+        journeys, *road = _parsed(size)
+        for name, figures in by_solver.items():
+            runs.setdefault((name, tuple(road)), []).append((journeys, figures))
+    for (name, (frames, signs)), series in runs.items():
+        counts = np.log([journeys for journeys, _ in series])
+        if len(set(counts)) < 3:
+            continue
+        time_s, memory = (
+            np.polyfit(counts, np.log([figures[key] for _, figures in series]), 1)[0]
+            for key in ("solve_s", "peak_gb")
+        )
+        least, most = min(j for j, _ in series), max(j for j, _ in series)
+        yield (
+            f"{name}: {frames} frames x {signs} signs, {least} to {most} journeys: time grows "
+            f"with the power {time_s:.2f} of their number, memory with {memory:.2f}"
+        )
+
+
+def _parsed(size: str) -> tuple[int, int, int]:
     try:
         journeys, frames, signs = (int(part) for part in size.split("x"))
     except ValueError:
         raise ValueError(f"--sizes: expected JOURNEYSxFRAMESxSIGNS, found {size!r}") from None
-    problem = free_corners.simulate(journeys, frames, signs)
+    return journeys, frames, signs
+
+
+def _race(size: str, options: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """All solvers on one size, in turns, each in a fresh process; the medians of each, printed as a line."""
+    problem = free_corners.simulate(*_parsed(size))
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / "problem.npz", Path(folder) / "result.npz"
         problem.save(path)
@@ -165,12 +204,13 @@ def _race(size: str, options: argparse.Namespace) -> None:
                         problem, result["q"], result["p"], result["X"]
                     )
                 runs[name].append(figures)
+    medians = {}
     for name, done in runs.items():
         head = f"{size:>14} {len(problem.obs_pt):>9} {name:>7}"
         if name in failed:
             print(f"{head} {failed[name]}")
             continue
-        middle = {
+        medians[name] = middle = {
             key: statistics.median(one[key] for one in done)
             for key in ("setup_s", "solve_s", "iterations", "peak_gb", "cost")
         }
@@ -179,6 +219,7 @@ def _race(size: str, options: argparse.Namespace) -> None:
             f"{middle['iterations']:>6.0f} {middle['peak_gb']:>5.2f} GB {middle['cost']:>16.4f}",
             flush=True,
         )
+    return medians
 
 
 class _Failed(Exception):

@@ -30,6 +30,8 @@ from crowdmap_torch.optim.parallel import in_order
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
 
 _Blocks = TypeVar("_Blocks", bound=RowGradients)
+_WORTH_HALVING = 64
+"""Width of a window from which half of the entries below the diagonal are not worked out."""
 
 
 @dataclass
@@ -104,7 +106,7 @@ class _Workspace:
     """What the solves of one back end share: memory is taken once."""
 
     store: Float[Tensor, "rows k"]
-    """Per eliminated block and column of its window a row of `k`; once eliminated, times its inverse diagonal."""
+    """Per eliminated block and column of its window a row of `k`; once eliminated, whitened by its diagonal."""
     factor: _Factor | None = None
     """Of the last solve."""
 
@@ -113,12 +115,12 @@ class _Workspace:
 class _Factor:
     """The factorised matrix, together with the boundary store."""
 
-    inverses: list[Float[Tensor, "_ k k"]]
-    """By batch: inverse diagonals."""
+    whiten: list[Float[Tensor, "_ k k"]]
+    """By batch: inverse Cholesky factors of the diagonals."""
     towards: list[Float[Tensor, "_ k _"]]
     """By batch: minus the inverse diagonals times the links to the neighbours."""
     reduced: Float[Tensor, "r r"]
-    """Cholesky factor of the reduced system."""
+    """Cholesky factor of the reduced system, the upper one."""
 
 
 @dataclass(frozen=True)
@@ -174,12 +176,12 @@ class ChainNormalEquations:
         scale = damping[0]
         added_chain = scale * self.diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(DIAGONAL_FLOOR)
         added = scale * self.hessian.diagonal().clamp_min(DIAGONAL_FLOOR)
-        matrix, right_side, inverses, towards = self._reduce(added_chain, added)
-        reduced, failed = torch.linalg.cholesky_ex(matrix)
+        matrix, right_side, whiten, towards = self._reduce(added_chain, added)
+        reduced, failed = torch.linalg.cholesky_ex(matrix, upper=True)
         if bool(failed) or not bool(matrix.isfinite().all()):
             return self._failed()
-        factor = self.workspace.factor = _Factor(inverses, towards, reduced)
-        packed = -torch.cholesky_solve(right_side[:, None], reduced)[:, 0]
+        factor = self.workspace.factor = _Factor(whiten, towards, reduced)
+        packed = -torch.cholesky_solve(right_side[:, None], reduced, upper=True)[:, 0]
         chain_step = self._substitute(packed, factor)
         along = (self.chain_gradient * chain_step).sum() + self.gradient @ packed
         damped = (added_chain * chain_step.square()).sum() + added @ packed.square()
@@ -193,21 +195,23 @@ class ChainNormalEquations:
         gradient[structure.place] = self.chain_gradient
         right_side = torch.nn.functional.pad(self.gradient, (0, 2))
 
-        def pass_on(item: tuple[Batch, Tensor]) -> tuple[Tensor, Tensor]:
-            batch, leads = item
+        def pass_on(item: tuple[Batch, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+            batch, whiten, leads = item
             groups, size, w, _ = batch.fill.shape
             own = gradient[batch.place][..., None]
-            seen = (_rows(batch, self.workspace.store) @ own).view(groups, size, w).sum(1)
+            rows = _rows(batch, self.workspace.store)
+            seen = (rows @ (whiten @ own)).view(groups, size, w).sum(1)
             return seen.neg_().flatten(), (leads.mT @ own).view(-1, own.shape[1])
 
-        towards = iter(factor.towards)
+        parts = zip(factor.whiten, factor.towards, strict=True)
         for level in structure.levels:
-            items = [(batch, next(towards)) for batch in level.batches]
+            items = [(batch, *next(parts)) for batch in level.batches]
             passed = in_order(pass_on, items, gradient.device)
             for batch, (seen, across) in zip(level.batches, passed, strict=True):
                 right_side.index_add_(0, batch.columns.flatten(), seen)
                 gradient.index_add_(0, batch.neighbour.flatten(), across)
-        packed = -torch.cholesky_solve(right_side[: len(self.gradient), None], factor.reduced)[:, 0]
+        right_side = right_side[: len(self.gradient), None]
+        packed = -torch.cholesky_solve(right_side, factor.reduced, upper=True)[:, 0]
         chain_step = self._substitute(packed, factor, gradient)
         along = (self.chain_gradient * chain_step).sum() + self.gradient @ packed
         return self._step(packed, chain_step, -along / 2)
@@ -223,17 +227,17 @@ class ChainNormalEquations:
         nothing = torch.zeros_like(self.diagonal[..., 0])
         # The floor keeps a landmark that nothing observes invertible; its variance says so.
         added = torch.full_like(self.gradient, floor)
-        matrix, _, inverses, towards = self._reduce(nothing, added)
+        matrix, _, whiten, towards = self._reduce(nothing, added)
         if not bool(matrix.isfinite().all()):
             raise ValueError("the chain's blocks are not positive definite without damping")
-        reduced = torch.linalg.cholesky(matrix)
-        self.workspace.factor = _Factor(inverses, towards, reduced)
-        return torch.cholesky_inverse(reduced)
+        reduced = torch.linalg.cholesky(matrix, upper=True)
+        self.workspace.factor = _Factor(whiten, towards, reduced)
+        return torch.cholesky_inverse(reduced, upper=True)
 
     def solve_reduced(self, right: Float[Tensor, "r m"]) -> Float[Tensor, "r m"]:
         """Landmarks that solve the last factorised reduced system for other right-hand sides."""
         assert self.workspace.factor is not None
-        return torch.cholesky_solve(right, self.workspace.factor.reduced)
+        return torch.cholesky_solve(right, self.workspace.factor.reduced, upper=True)
 
     def solve_chains(self, right: Float[Tensor, "n k m"]) -> Float[Tensor, "n k m"]:
         """Eliminated blocks that solve the last factorised system with the landmarks held.
@@ -246,13 +250,13 @@ class ChainNormalEquations:
         force[structure.place] = right
         solved = torch.zeros_like(force)
         batches = [batch for level in structure.levels for batch in level.batches]
-        steps = list(zip(batches, factor.inverses, factor.towards, strict=True))
+        steps = list(zip(batches, factor.whiten, factor.towards, strict=True))
         for batch, _, leads in steps:
             passed = (leads.mT @ force[batch.place]).view(-1, *right.shape[1:])
             force.index_add_(0, batch.neighbour.flatten(), passed)
-        for batch, inverse, leads in reversed(steps):
+        for batch, whiten, leads in reversed(steps):
             beside = solved[batch.neighbour].flatten(1, 2)
-            solved[batch.place] = inverse @ force[batch.place] + leads @ beside
+            solved[batch.place] = whiten.mT @ (whiten @ force[batch.place]) + leads @ beside
         return solved[structure.place]
 
     def by_landmark(
@@ -293,9 +297,10 @@ class ChainNormalEquations:
     def _reduce(
         self, added_chain: Tensor, added: Tensor
     ) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor]]:
-        """The Schur complement on the landmarks and its right-hand side; inverse diagonals and leads, by batch.
+        """The Schur complement on the landmarks, its right-hand side, and by batch the whitening and the leads.
 
-        The eliminated rows are in the store. What is not positive definite gives numbers that are not finite.
+        Only the upper triangle of the complement counts. The eliminated rows are in the store. What is not positive
+        definite gives numbers that are not finite.
         """
         structure, store = self.structure, self.workspace.store
         store.zero_()
@@ -312,7 +317,7 @@ class ChainNormalEquations:
         diagonal = torch.cat((self.diagonal + torch.diag_embed(added_chain), none))
         diagonal = diagonal[structure.order]
         link = torch.cat((self.link, torch.zeros_like(none)))[structure.order]
-        inverses, towards = [], []
+        whiten, towards = [], []
         for level in structure.levels:
             parts = in_order(
                 lambda batch: _eliminate(batch, diagonal, link, store, len(system)),
@@ -320,12 +325,12 @@ class ChainNormalEquations:
                 store.device,
             )
             for batch, part in zip(level.batches, parts, strict=True):
-                inverses.append(part.inverse)
+                whiten.append(part.whiten)
                 towards.append(part.towards)
                 _pass_on(batch, part.square, diagonal, link)
                 system.view(-1).index_add_(0, part.at, part.product)
                 store.index_add_(0, batch.fill.flatten(), part.fill)
-        return system[:dim, :dim], system[dim, :dim], inverses, towards
+        return system[:dim, :dim], system[dim, :dim], whiten, towards
 
     def _substitute(
         self, packed: Tensor, factor: _Factor, gradient: Tensor | None = None
@@ -340,21 +345,19 @@ class ChainNormalEquations:
         step = packed.new_zeros(len(structure.order), k)
 
         def solve(item: tuple[Batch, Tensor, Tensor]) -> Tensor:
-            batch, inverse, leads = item
+            batch, whiten, leads = item
             window = known[batch.columns].repeat_interleave(batch.fill.shape[1], 0)[:, None]
             own = (window @ _rows(batch, self.workspace.store)).mT
             if gradient is not None:
-                own = own + inverse @ gradient[batch.place][..., None]
+                own = own + whiten @ gradient[batch.place][..., None]
             beside = step[batch.neighbour].flatten(1)[..., None]
-            return (leads @ beside - own)[..., 0]
+            return (leads @ beside - whiten.mT @ own)[..., 0]
 
-        last = len(factor.inverses)
+        last = len(factor.whiten)
         for level in reversed(structure.levels):
             mine = slice(last - len(level.batches), last)
             last = mine.start
-            items = list(
-                zip(level.batches, factor.inverses[mine], factor.towards[mine], strict=True)
-            )
+            items = list(zip(level.batches, factor.whiten[mine], factor.towards[mine], strict=True))
             for batch, part in zip(level.batches, in_order(solve, items, step.device), strict=True):
                 step[batch.place] = part
         return step[structure.place]
@@ -380,7 +383,8 @@ def _rows(batch: Batch, store: Tensor) -> Tensor:
 class _Part:
     """What the elimination of a batch leaves to others."""
 
-    inverse: Float[Tensor, "e k k"]
+    whiten: Float[Tensor, "e k k"]
+    """Inverse Cholesky factors of the diagonals."""
     towards: Float[Tensor, "e k _"]
     """Minus the inverse diagonals times the links to the neighbours."""
     square: Float[Tensor, "e _ _"]
@@ -404,15 +408,20 @@ def _eliminate(batch: Batch, diagonal: Tensor, link: Tensor, store: Tensor, stri
         links = torch.cat((link[batch.neighbour[:, 0]].mT, links), dim=-1)
     leads = (inverse @ links).neg_()
     rows = _rows(batch, store)
-    solved = rows @ inverse
-    left = rows.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
-    right = solved.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
-    at = (batch.columns[:, :, None] * stride + batch.columns[:, None]).flatten()
-    product = (left @ right.mT).neg_().flatten()
     # Adding rows as they are is several times faster than subtracting them: the leads carry the sign.
     fill = (rows @ leads).view(-1, k)
-    rows.copy_(solved)
-    return _Part(inverse, leads, links.mT @ leads, at, product, fill)
+    whiten = factor.mT @ inverse
+    rows.copy_(rows @ whiten.mT)
+    wide = rows.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
+    half = w // 2 if w >= _WORTH_HALVING else w
+    ats, products = [], []
+    for here, there in ((slice(half), slice(w)), (slice(half, w), slice(half, w))):
+        if here.start == w:
+            continue
+        column = batch.columns[:, there]
+        ats.append((batch.columns[:, here, None] * stride + column[:, None]).flatten())
+        products.append((wide[:, here] @ wide[:, there].mT).neg_().flatten())
+    return _Part(whiten, leads, links.mT @ leads, torch.cat(ats), torch.cat(products), fill)
 
 
 def _assemble(

@@ -26,7 +26,9 @@ from crowdmap_torch.optim.problem import Problem, Values, retract
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
 _NEAR_BEST = 0.2
-"""Steps that should be longer or shorter by less than this share stay as they are."""
+"""Steps that should be longer or shorter by less than this share stay as they are ..."""
+_NEAR_ENOUGH = 0.5
+"""... and those with a kept matrix by less than this: the next one learns from what is left."""
 REASONS = (
     "still running",
     "converged: the cost no longer falls",
@@ -57,22 +59,25 @@ class LmConfig:
     """Longest that an accepted step may be made, as a multiple, where the model proved wrong about its length: the
     weights of robust losses overrate the curvature. 1: never; a change costs one more evaluation of the cost."""
     reuse_below: float = 0.0
-    """Once a step lowers the cost by less than this share, the factorised matrix is kept for the steps that follow:
-    conjugate directions of anew computed gradients, preconditioned by it, at a third of the price. 0: never."""
+    """Once a step lowers the cost by less than this share, the factorised matrix is kept for the steps that follow, at a
+    third of the price: limited-memory BFGS that starts from it and learns from the gradients what it has wrong. 0: never."""
 
 
 @dataclass(frozen=True)
-class _Course:
-    """A step taken with a matrix that is kept."""
+class _Place:
+    """Where steps with a kept matrix came by."""
 
     normal: ReusableEquations
     newton: Mapping[str, Tensor]
-    """The Newton step there, and the derivative along it."""
-    slope: Float[Tensor, " groups"]
-    direction: Mapping[str, Tensor]
-    """The direction that was taken."""
-    length: Float[Tensor, " groups"]
-    """And how far along it, as a multiple."""
+    """The step there by the kept matrix."""
+    step: Mapping[str, Tensor]
+    """The step that was taken from there."""
+
+
+_Course = tuple[_Place, ...]
+"""The last places, oldest first."""
+_MEMORY = 5
+"""Most places that are remembered."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +98,10 @@ class LmState:
     reason: Int[Tensor, " groups"]
     """Index into `REASONS`."""
     normal: NormalEquations | None = field(default=None, repr=False)
-    """Normal equations at the values; None where they moved since, or the problem changed."""
-    course: _Course | None = field(default=None, repr=False)
-    """Where the steps follow conjugate directions: the last one."""
+    """Normal equations at the values; None where they moved since, or the problem changed. On a course: the gradient
+    there, and the matrix that is kept."""
+    course: _Course = field(default=(), repr=False)
+    """Where the matrix is kept: the way since it was factorised."""
     iterations: int = 0
     linearizations: int = 0
 
@@ -132,31 +138,27 @@ def step(
     problem: Problem, state: LmState, config: LmConfig, *, backend: Backend | None = None
 ) -> LmState:
     """The state after one step: each problem that is still running moves, or raises its damping."""
-    normal, course = state.normal, state.course
-    if course is not None:
-        normal = course.normal.moved(problem, state.values)
-    elif normal is None:
+    if state.course:
+        return _step_on_course(problem, state, config)
+    normal = state.normal
+    if normal is None:
         normal = (backend or DenseBackend()).assemble(problem, state.values)
         state = replace(state, linearizations=state.linearizations + 1)
     running = state.reason == RUNNING
-    proposal = newton = normal.solve(state.damping)
-    if course is not None:
-        proposal = _conjugate(course, normal, newton)
-    # Directions along one course want about the same length.
-    length = torch.ones_like(state.damping) if course is None else course.length
+    proposal = normal.solve(state.damping)
+    length = torch.ones_like(state.damping)
     candidate, term_cost, cost = _trial(problem, state.values, proposal.delta, length)
     decrease = normal.cost - cost
     gain = decrease / proposal.predicted.clamp_min(torch.finfo(cost.dtype).tiny)
     accepted = running & proposal.solved & cost.isfinite() & (decrease > 0)
     if config.max_stretch > 1:
         # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
-        curvature = (2 * length - gain) / length.square()
-        best = (1 / curvature.clamp_min(1 / config.max_stretch)).where(accepted, length)
-        if bool(((best / length - 1).abs() > _NEAR_BEST).any()):
+        best = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(accepted, length)
+        if bool(((best - 1).abs() > _NEAR_BEST).any()):
             other = _trial(problem, state.values, proposal.delta, best)
+            length = torch.where(other[2] < cost, best, length)
             candidate, term_cost, cost = _better(problem, (candidate, term_cost, cost), other)
             decrease = normal.cost - cost
-        length = best
 
     shrink = (1 - (2 * gain - 1) ** 3).clamp(1 / 3, 2.0)
     damping = torch.where(accepted, state.damping * shrink, state.damping * state.growth)
@@ -173,17 +175,13 @@ def step(
     reason[running & ~accepted & (damping > config.max_damping) & (reason == RUNNING)] = STALLED
 
     moved = bool(accepted.any())
-    if course is not None and not moved:
-        # The kept matrix no longer serves: linearise here, and judge by that.
-        return replace(state, course=None, normal=None, iterations=state.iterations + 1)
-    following = None
+    course: _Course = ()
     keeps = bool((decrease <= config.reuse_below * normal.cost).all())
     if moved and keeps and isinstance(normal, ReusableEquations):
-        slope = normal.slope(newton.delta)
-        following = _Course(normal, newton.delta, slope, proposal.delta, length)
+        course = (_Place(normal, proposal.delta, _scaled(problem, proposal.delta, length)),)
     return replace(
         state,
-        course=following,
+        course=course,
         values=_merge(problem, state.values, candidate, accepted) if moved else state.values,
         damping=damping,
         growth=growth,
@@ -202,18 +200,97 @@ def step(
     )
 
 
-def _conjugate(course: _Course, normal: NormalEquations, newton: Step) -> Step:
-    """The direction conjugate to that of `course` (Polak and Ribiere, restarted where it would turn back)."""
+def _step_on_course(problem: Problem, state: LmState, config: LmConfig) -> LmState:
+    """A step with the matrix kept: the gradient where it leads tells its length, and serves the next."""
+    course, normal = state.course, state.normal
+    if normal is None:
+        normal = course[-1].normal.moved(problem, state.values)
     assert isinstance(normal, ReusableEquations)
-    slope = normal.slope(newton.delta)
-    turn = ((slope - normal.slope(course.newton)) / course.slope).clamp_min(0)
-    direction = {
-        name: tangent + turn * course.direction[name] for name, tangent in newton.delta.items()
-    }
-    along = normal.slope(direction)
-    if bool((along > slope / 2).any()):
+    newton = normal.solve(state.damping)
+    proposal = _quasi_newton(course, normal, newton)
+    slope = normal.slope(proposal.delta)
+    length = torch.ones_like(slope)
+    candidate, there = _look(problem, state.values, normal, proposal.delta, length)
+    curvature = (there.slope(proposal.delta) - slope) / -slope
+    best = 1 / curvature.clamp_min(1 / config.max_stretch)
+    if config.max_stretch > 1 and bool(((best - 1).abs() > _NEAR_ENOUGH).any()):
+        other, there_too = _look(problem, state.values, normal, proposal.delta, best)
+        if bool((there_too.cost < there.cost).all()):
+            candidate, there, length = other, there_too, best
+    decrease = normal.cost - there.cost
+    state = replace(state, iterations=state.iterations + 1, normal=None, course=())
+    if not bool(((decrease > 0) & proposal.solved & there.cost.isfinite()).all()):
+        # The kept matrix no longer serves: linearise here, and judge by that.
+        return replace(state, accepted=torch.zeros_like(state.accepted))
+    keeps = bool((decrease <= config.reuse_below * normal.cost).all())
+    if keeps:
+        place = _Place(normal, newton.delta, _scaled(problem, proposal.delta, length))
+        state = replace(state, course=(*course, place)[-_MEMORY:], normal=there)
+    done = (decrease <= config.cost_tolerance * normal.cost) & (state.reason == RUNNING)
+    return replace(
+        state,
+        values=candidate,
+        cost=there.cost,
+        term_cost=there.term_cost,
+        gain_ratio=decrease / proposal.predicted,
+        step_norm=proposal.norm,
+        accepted=torch.ones_like(state.accepted),
+        reason=torch.where(done, CONVERGED_COST, state.reason),
+    )
+
+
+def _look(
+    problem: Problem,
+    values: Values,
+    normal: ReusableEquations,
+    delta: Mapping[str, Tensor],
+    length: Tensor,
+) -> tuple[dict[str, Tensor], ReusableEquations]:
+    """Values at a multiple of the step, with cost and gradient there."""
+    candidate = retract(problem, values, _scaled(problem, delta, length))
+    return candidate, normal.moved(problem, candidate)
+
+
+def _quasi_newton(course: _Course, normal: ReusableEquations, newton: Step) -> Step:
+    """The step of limited-memory BFGS from the kept matrix and the way since (Nocedal and Wright 2006, algorithm 7.4).
+
+    The kept matrix's inverse times a difference of gradients is the difference of its own steps, so that nothing is
+    solved but the `newton` step here; and the step sought is a sum of steps that are there, so that the recursion is
+    one of their shares, by the derivatives of the cost along each of them at every place.
+    """
+    newtons = [place.newton for place in course] + [newton.delta]
+    spans = [place.step for place in course] + newtons
+    count = len(course)
+    slope = torch.stack(
+        [
+            torch.stack([there.slope(along) for along in spans]).flatten()
+            for there in [*(place.normal for place in course), normal]
+        ]
+    ).cpu()
+    bend = slope[1:] - slope[:-1]
+    """Change of the derivatives over each step that was taken."""
+    turns = bend[:, :count].diagonal()
+    learnt = torch.nonzero(turns > 0)[:, 0].tolist()
+    share = torch.zeros_like(slope[0])
+    share[-1] = 1
+    weight = torch.zeros_like(turns)
+    for i in reversed(learnt):
+        weight[i] = (slope[-1, i] - weight @ bend[:, i]) / turns[i]
+        share[count + i + 1] -= weight[i]
+        share[count + i] += weight[i]
+    if learnt:
+        last = learnt[-1]
+        by_matrix = bend[last, count + last] - bend[last, count + last + 1]
+        share *= turns[last] / by_matrix
+    for i in learnt:
+        share[i] -= weight[i] + bend[i] @ share / turns[i]
+    if not slope[-1] @ share < slope[-1, -1] / 10:
         return newton
-    return replace(newton, delta=direction, predicted=-along / 2)
+    direction = {name: torch.zeros_like(tangent) for name, tangent in newton.delta.items()}
+    for part, delta in zip(share.tolist(), spans, strict=True):
+        for name, tangent in direction.items():
+            tangent.add_(delta[name], alpha=part)
+    return replace(newton, delta=direction, predicted=-normal.slope(direction) / 2)
 
 
 _Trial = tuple[dict[str, Tensor], dict[str, Tensor], Tensor]
@@ -224,13 +301,20 @@ def _trial(
     problem: Problem, values: Values, delta: Mapping[str, Tensor], length: Float[Tensor, " groups"]
 ) -> _Trial:
     """What comes out at a multiple of the step."""
+    candidate = retract(problem, values, _scaled(problem, delta, length))
+    term_cost = term_costs(problem, candidate)
+    return candidate, term_cost, torch.stack(list(term_cost.values())).sum(0)
+
+
+def _scaled(
+    problem: Problem, delta: Mapping[str, Tensor], length: Float[Tensor, " groups"]
+) -> dict[str, Tensor]:
+    """A multiple of the step."""
     scaled = {}
     for name, tangent in delta.items():
         group = problem.variables[name].group
         scaled[name] = tangent * (length[0] if group is None else length[group][:, None])
-    candidate = retract(problem, values, scaled)
-    term_cost = term_costs(problem, candidate)
-    return candidate, term_cost, torch.stack(list(term_cost.values())).sum(0)
+    return scaled
 
 
 def _better(problem: Problem, first: _Trial, second: _Trial) -> _Trial:
@@ -248,7 +332,7 @@ def _better(problem: Problem, first: _Trial, second: _Trial) -> _Trial:
 def changed(state: LmState) -> LmState:
     """The state for a problem that changed (matches refreshed, scales narrowed): linearised anew, running again."""
     reason = torch.where(state.reason == NOT_FINITE, state.reason, RUNNING)
-    return replace(state, normal=None, course=None, reason=reason)
+    return replace(state, normal=None, course=(), reason=reason)
 
 
 def solve(

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from crowdmap_torch.benchmark import free_corners
-from crowdmap_torch.benchmark.bundle import LM, solve
+from crowdmap_torch.benchmark.bundle import LM, growth, solve
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.chain import ChainBackend
 from crowdmap_torch.optim.linear import DenseBackend
@@ -92,3 +92,15 @@ def test_a_file_that_is_no_problem_is_one_line(problem, tmp_path: Path, capsys, 
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "problem.npz" in said
+
+
+def test_growth_is_the_slope_of_the_logarithms():
+    def figures(journeys, power):
+        return {"solve_s": 0.01 * journeys**power, "peak_gb": 0.2 * journeys**0.5}
+
+    medians = {f"{j}x500x31": {"ours": figures(j, 1.25)} for j in (5, 25, 100)}
+    medians["25x500x200"] = {"ours": figures(25, 3.0)}
+    (line,) = growth(medians)
+    assert "5 to 100 journeys" in line
+    assert "power 1.25" in line
+    assert "memory with 0.50" in line
