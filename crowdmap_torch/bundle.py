@@ -13,30 +13,15 @@ from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.lane_matching import LaneMatches, follow
 from crowdmap_torch.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.border import BorderedBackend
 from crowdmap_torch.optim.chain import ChainBackend
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable
 from crowdmap_torch.optim.robust import Tukey, median_scale
+from crowdmap_torch.pose_prior import PosePrior, PosePriorConfig
 
-
-@dataclass(frozen=True)
-class PosePriorConfig:
-    """What the positioning module gets wrong, where poses.parquet does not say; all sigmas per axis."""
-
-    bias_sigma_m: tuple[float, float, float] = (0.6, 0.6, 0.9)
-    """Constant error of a journey: east, north, up."""
-    drift_sigma_m: float = 0.25
-    """Slow error of the position, a Gauss-Markov chain along the way."""
-    drift_length_m: float = 150.0
-    """Way over which the drift's correlation falls to 1/e."""
-    rotation_sigma_deg: float = 0.2
-    """Slow error of the rotation about each axis."""
-    rotation_length_m: float = 100.0
-    """Way over which the rotation's correlation falls to 1/e."""
-    white_sigma_m: float = 0.02
-    """Noise of the position from frame to frame."""
-    white_sigma_deg: float = 0.03
-    """Noise of the rotation from frame to frame."""
+_SCALE_RESTS = 0.05
+"""A scale of the prior that would change by less than this share is at rest."""
 
 
 @dataclass(frozen=True)
@@ -81,19 +66,6 @@ class AdjustConfig:
     """Frames closer together than this (a car at a light) are thinned."""
 
 
-@dataclass(frozen=True)
-class DriftNodes:
-    """Stretches of road with one drift each: the blocks that form a journey's chain."""
-
-    of_frame: Int[Tensor, " p"]
-    """Node of each pose of the bundle."""
-    first: Int[Tensor, " n"]
-    """First pose of each node."""
-    journey: Int[Tensor, " n"]
-    way: Float[Tensor, " n"]
-    """Distance travelled at the node [m]."""
-
-
 class Bundle(nn.Module):
     """The unknowns of bundle adjustment and all observations of them.
 
@@ -106,6 +78,8 @@ class Bundle(nn.Module):
     match_valid: Tensor
     scale: Tensor
     """Standard deviation of sign corners and lane points [px], as the residuals show it."""
+    prior_scale: Tensor
+    """By journey, how far bias, drift and rotation are from the sigmas of `prior`."""
 
     def __init__(
         self,
@@ -117,7 +91,7 @@ class Bundle(nn.Module):
         matches: LaneMatches,
         lane_count: Int[Tensor, " n"],
         frame: Int[Tensor, " p"],
-        nodes: DriftNodes,
+        prior: PosePrior,
         beside: Int[Tensor, " c"],
         config: AdjustConfig,
     ) -> None:
@@ -129,6 +103,7 @@ class Bundle(nn.Module):
             increment = value.new_zeros(len(value), variables[name].tangent_dim)
             self.register_parameter(f"delta_{name}", nn.Parameter(increment))
         self.register_buffer("scale", torch.full((2,), torch.inf, dtype=values["pose"].dtype))
+        self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
         self.fixed = fixed
         self.corners = corners
         self.lane_points = lane_points
@@ -137,7 +112,7 @@ class Bundle(nn.Module):
         self.config = config
         self.frame = frame
         """Frame of each pose, counted over all journeys."""
-        self.nodes = nodes
+        self.prior = prior
         # Where each lane point was followed to is part of the checkpoint: matching starts from there.
         self.register_buffer("match_t", matches.t.clone())
         self.register_buffer("match_valid", matches.valid.clone())
@@ -163,16 +138,18 @@ class Bundle(nn.Module):
             getattr(self, f"base_{name}").copy_(values[name])
             getattr(self, f"delta_{name}").zero_()
 
-    def backend(self) -> ChainBackend:
-        """The solver's back end: frames hang on the drift's chains, and both are eliminated."""
-        return ChainBackend("drift", self.nodes.journey, leaves="pose", carrier=self.nodes.of_frame)
+    def backend(self) -> BorderedBackend:
+        """The solver's back end: frames hang on the drift's chains, both are eliminated, the biases go last."""
+        nodes = self.prior.nodes
+        chains = ChainBackend("drift", nodes.journey, leaves="pose", carrier=nodes.of_frame)
+        return BorderedBackend(chains, "bias")
 
     @torch.no_grad()
     def refresh(self) -> bool:
         """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
 
-        The scales start at what the residuals show, so that a wrong start does not make outliers of everything, and
-        fall as the fit improves; they never grow again.
+        The scales of pixels start at what the residuals show, so that a wrong start does not make outliers of
+        everything, and fall as the fit improves; they never grow again. Those of the poses' prior follow the drift.
         """
         values = self.values()
         if len(self.lane_points):
@@ -195,7 +172,11 @@ class Bundle(nn.Module):
         narrowed = torch.minimum(self.scale, seen)
         at_rest = bool((narrowed > 0.97 * self.scale).all())
         self.scale.copy_(narrowed)
-        return at_rest
+        rescaled = self.prior.rescaled(values["drift"], self.prior_scale)
+        moved = (rescaled / self.prior_scale).log().abs() > _SCALE_RESTS
+        # Within that they stay as they are, to the last digit: the cost is to fall from step to step.
+        self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))
+        return at_rest and not bool(moved.any())
 
     def _hold_slides(self, values: dict[str, Tensor]) -> None:
         """Keeps lanes from sliding along themselves within a step: nothing in the images says where they are.
@@ -216,7 +197,7 @@ class Bundle(nn.Module):
 
     def problem(self, *, held: bool = True) -> Problem:
         """The least-squares problem with the matches and scales of the moment; lanes `held` where they are, or not."""
-        terms = dict(self.fixed)
+        terms = {**self.prior.terms(self.prior_scale), **self.fixed}
         if held and self.held is not None:
             terms["lane_slide"] = self.held
         terms.update(self._corner_term(float(self.scale[0])))

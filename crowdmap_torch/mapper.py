@@ -25,6 +25,7 @@ from crowdmap_torch.crowd_signs import gather_signs
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.landmark_ids import lane_ids, sign_ids
 from crowdmap_torch.lane_matching import detection_lanes
+from crowdmap_torch.map_uncertainty import MapUncertainty, map_uncertainty
 from crowdmap_torch.observations import station
 from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.stages import adjust
@@ -108,6 +109,10 @@ class MapResult:
     associations: tuple[Association, ...]
     poses: tuple[Float[Tensor, "f 4 4"], ...]
     """Refined camera poses."""
+    uncertainty: MapUncertainty
+    """Of the signs and lanes of the map, tentative signs left out, and of the journeys' errors."""
+    prior_scale: Float[Tensor, "j 3"]
+    """By journey, how far the sigmas of its bias, drift and rotation were from those given."""
     state: LmState
     control_points: int = 0
     """Surveyed signs that pin the map."""
@@ -275,7 +280,8 @@ def finish_map(
     """The adjusted map with its covariances, the refined poses, and which landmark each detection shows."""
     journeys = dataset.journeys
     poses = adjust.read_poses(bundle, journeys)
-    signs, lanes, shared = adjust.read_map(bundle, first.signs, first.lanes)
+    uncertainty = map_uncertainty(bundle, first.signs, first.lanes)
+    signs, lanes = adjust.read_map(bundle, first.signs, first.lanes, uncertainty)
     associations = first.associations
     if first.harvest is not None:
         # Once more with the adjusted poses: what the first projections were too far off for.
@@ -292,10 +298,22 @@ def finish_map(
         for journey, m, pose, association in zip(journeys, maps, poses, associations, strict=True)
     )
     provenance = {"config": config_hash(config), "journeys": [j.journey_id for j in journeys]}
+    shared = uncertainty.shared
     hd_map = as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
     clusters = clusters_map(dataset, replace(first, associations=associations), provenance)
     known = len(bundle.fixed["control"]) if "control" in bundle.fixed else 0
-    return MapResult(hd_map, clusters, tuple(maps), first, associations, poses, state, known)
+    return MapResult(
+        hd_map=hd_map,
+        map_clusters=clusters,
+        journey_maps=tuple(maps),
+        first=first,
+        associations=associations,
+        poses=poses,
+        uncertainty=uncertainty,
+        prior_scale=bundle.prior_scale.clone(),
+        state=state,
+        control_points=known,
+    )
 
 
 def clusters_map(dataset: Dataset, first: FirstMap, provenance: dict | None = None) -> HdMap:

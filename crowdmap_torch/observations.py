@@ -28,6 +28,8 @@ class CornerObservations(Rows):
     """The corner for width and height one, on the sign's plane."""
     matrix: Float[Tensor, "m 3 3"]
     """Observation matrix (geometry.camera)."""
+    box_px: Float[Tensor, " m"]
+    """Larger side of the detection's box in the image."""
 
 
 @dataclass(frozen=True)
@@ -106,12 +108,15 @@ def _corners(
     px, ideal = (
         corners[used].gather(1, at) for corners in (detections.corners_px, detections.corners_ideal)
     )
+    # Slots past the shape's number of corners repeat one of them.
+    box = (px.amax(1) - px.amin(1)).amax(-1)
     row, corner = torch.nonzero(polygon.corner_mask(shape), as_tuple=True)
     return CornerObservations(
         frame=detections.frame[used][row] + offset,
         sign=sign[row],
         template=polygon.template(shape)[row, corner],
         matrix=camera.observation_matrix(journey.rig.camera, px[row, corner], ideal[row, corner]),
+        box_px=box[row],
     )
 
 

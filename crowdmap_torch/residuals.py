@@ -177,15 +177,21 @@ def relative_pose(
 def drift_transition(
     drift_from: Float[Tensor, " 6"],
     drift_to: Float[Tensor, " 6"],
+    bias: Float[Tensor, " 6"],
     persistence: Float[Tensor, " 6"],
 ) -> Float[Tensor, " 6"]:
-    """Innovation of the drift between two frames, `d_to - persistence * d_from`: a Gauss-Markov chain."""
-    return drift_to - persistence * drift_from
+    """Innovation of the drift between two places: a Gauss-Markov chain about the journey's constant bias."""
+    return drift_to - bias - persistence * (drift_from - bias)
 
 
-def drift_start(drift: Float[Tensor, " 6"]) -> Float[Tensor, " 6"]:
-    """The drift in a journey's first frame, whose prior is zero with the module's absolute sigma."""
-    return drift
+def drift_start(drift: Float[Tensor, " 6"], bias: Float[Tensor, " 6"]) -> Float[Tensor, " 6"]:
+    """How far the drift is from the journey's bias in its first frame."""
+    return drift - bias
+
+
+def constant_bias(bias: Float[Tensor, " 6"]) -> Float[Tensor, " 6"]:
+    """What a journey's poses have wrong from start to end: next to nothing, by the module's absolute sigma."""
+    return bias
 
 
 def pixel_error_and_jacobian(
@@ -314,8 +320,7 @@ def pose_deviation_jacobian(
 ) -> tuple[Float[Tensor, "m 6"], tuple[Tensor, Tensor]]:
     """`pose_deviation` and its Jacobians by pose and drift; the rotation's is the inverse right Jacobian of SO(3)."""
     error, (by_pose,) = pose_prior_jacobian(T_world_camera, prior)
-    by_drift = -torch.eye(6, dtype=error.dtype, device=error.device).expand(len(error), 6, 6)
-    return error - drift, (by_pose, by_drift)
+    return error - drift, (by_pose, -_identity(drift))
 
 
 def pose_prior_jacobian(
@@ -345,12 +350,34 @@ def relative_pose_jacobian(
 def drift_transition_jacobian(
     drift_from: Float[Tensor, "m 6"],
     drift_to: Float[Tensor, "m 6"],
+    bias: Float[Tensor, "m 6"],
     persistence: Float[Tensor, "m 6"],
+) -> tuple[Float[Tensor, "m 6"], tuple[Tensor, Tensor, Tensor]]:
+    """`drift_transition` and its Jacobians by the two drifts and the bias."""
+    change = drift_to - bias - persistence * (drift_from - bias)
+    keep = torch.diag_embed(persistence)
+    eye = _identity(change)
+    return change, (-keep, eye, keep - eye)
+
+
+def drift_start_jacobian(
+    drift: Float[Tensor, "m 6"], bias: Float[Tensor, "m 6"]
 ) -> tuple[Float[Tensor, "m 6"], tuple[Tensor, Tensor]]:
-    """`drift_transition` and its Jacobians by the two drifts."""
-    eye = torch.eye(6, dtype=drift_to.dtype, device=drift_to.device)
-    change = drift_to - persistence * drift_from
-    return change, (-torch.diag_embed(persistence), eye.expand(len(change), 6, 6))
+    """`drift_start` and its Jacobians by drift and bias."""
+    eye = _identity(drift)
+    return drift - bias, (eye, -eye)
+
+
+def constant_bias_jacobian(
+    bias: Float[Tensor, "m 6"],
+) -> tuple[Float[Tensor, "m 6"], tuple[Tensor]]:
+    """`constant_bias` and its Jacobian."""
+    return bias, (_identity(bias),)
+
+
+def _identity(tangent: Float[Tensor, "m k"]) -> Float[Tensor, "m k k"]:
+    m, k = tangent.shape
+    return torch.eye(k, dtype=tangent.dtype, device=tangent.device).expand(m, k, k)
 
 
 def _through_pose(

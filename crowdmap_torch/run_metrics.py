@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from crowdmap_torch.config import MapperConfig, dump
 from crowdmap_torch.evaluate import MapFigures, compare_map_signs
+from crowdmap_torch.geometry import polygon
 from crowdmap_torch.mapper import MapResult, certain_part
 from crowdmap_torch.observations import station
 from crowdmap_torch.report.record import Iteration, JourneySummary, Pruned, RunRecord, Spectrum
@@ -71,10 +73,17 @@ def pruned_of(dataset: Dataset, result: MapResult) -> tuple[Pruned, ...]:
 def journey_summaries(dataset: Dataset, result: MapResult) -> tuple[JourneySummary, ...]:
     """One line for each journey in use."""
     summaries = []
-    for journey, made, association, poses in zip(
-        dataset.journeys, result.journey_maps, result.associations, result.poses, strict=True
+    found = result.uncertainty
+    sigmas = found.bias_covariance.diagonal(dim1=1, dim2=2).sqrt()
+    for journey, made, association, bias, sigma in zip(
+        dataset.journeys,
+        result.journey_maps,
+        result.associations,
+        found.bias.tolist(),
+        sigmas.tolist(),
+        strict=True,
     ):
-        east, north, up = (poses - journey.T_world_camera)[:, :3, 3].mean(0).tolist()
+        east, north, up, heading = bias
         summaries.append(
             JourneySummary(
                 journey_id=journey.journey_id,
@@ -83,9 +92,24 @@ def journey_summaries(dataset: Dataset, result: MapResult) -> tuple[JourneySumma
                 used=int((association.sign >= 0).sum()),
                 signs=len(made.signs),
                 bias=(east, north, up),
+                bias_sigma=(sigma[0], sigma[1], sigma[2]),
+                heading_deg=math.degrees(heading),
+                heading_sigma_deg=math.degrees(sigma[3]),
             )
         )
     return tuple(summaries)
+
+
+def corner_covariances(result: MapResult) -> list[dict[str, object]]:
+    """Of every adjusted sign the covariances of its corners, nine numbers each [m^2], in the order of the map's."""
+    signs, covariance = result.hd_map.signs, result.uncertainty.corner.flatten(2)
+    count = polygon.corner_count(signs.shape[: len(covariance)]).tolist()
+    return [
+        {"sign_id": name, "covariance": of_corner[:corners]}
+        for name, of_corner, corners in zip(
+            result.hd_map.sign_id, covariance.tolist(), count, strict=False
+        )
+    ]
 
 
 def metrics_of(
@@ -127,9 +151,19 @@ def metrics_of(
                 "sign_detections_used": s.used,
                 "signs": s.signs,
                 "bias_m": s.bias,
+                "bias_covariance": covariance[:3, :3].flatten(),
+                "heading_deg": s.heading_deg,
+                "heading_sigma_deg": s.heading_sigma_deg,
+                "sigma_scale": dict(zip(("bias", "drift", "rotation"), scale, strict=True)),
             }
-            for s in summaries
+            for s, covariance, scale in zip(
+                summaries,
+                result.uncertainty.bias_covariance,
+                result.prior_scale.tolist(),
+                strict=True,
+            )
         ],
+        "sign_corners": corner_covariances(result),
         "survey": None if figures is None else figures.as_dict(),
         "survey_clusters": None if figures_before is None else figures_before.as_dict(),
     }

@@ -146,16 +146,18 @@ def test_pose_deviation_jacobian_equals_autograd(generator, spread):
     )
 
 
-def test_drift_transition_jacobian_equals_autograd(generator):
-    drifts = [torch.randn(M, 6, dtype=torch.float64, generator=generator) for _ in range(2)]
+def test_drift_jacobians_equal_autograd(generator):
+    drifts = [torch.randn(M, 6, dtype=torch.float64, generator=generator) for _ in range(3)]
     persistence = torch.rand(M, 6, dtype=torch.float64, generator=generator)
     check(
         residuals.drift_transition,
         residuals.drift_transition_jacobian,
         drifts,
-        (add, add),
+        (add, add, add),
         (persistence,),
     )
+    check(residuals.drift_start, residuals.drift_start_jacobian, drifts[:2], (add, add), ())
+    check(residuals.constant_bias, residuals.constant_bias_jacobian, drifts[:1], (add,), ())
 
 
 def test_a_point_behind_the_camera_leaves_finite_errors_and_jacobians(scene):

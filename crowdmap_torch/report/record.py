@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -57,8 +58,11 @@ class JourneySummary:
     signs: int
     """Signs of its own triangulation."""
     bias: tuple[float, float, float]
-    """East, north, up: estimated minus given position, in the mean [m]."""
-    heading_deg: float = 0.0
+    """East, north, up: adjusted minus given position, in the mean along the way [m]; NaN if it had no say."""
+    bias_sigma: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    heading_deg: float = math.nan
+    """The same of the heading, counted from east to north."""
+    heading_sigma_deg: float = math.nan
     true_bias: tuple[float, float, float] | None = None
     """The same against the true poses (simulated data only)."""
 

@@ -119,16 +119,16 @@ def error_table(figures: MapFigures, before: MapFigures | None) -> str:
 
 
 def bias_table(journeys: Sequence[JourneySummary]) -> str:
-    """One row a journey: its bias and what of it was used; sortable."""
+    """One row a journey: what of it was used, its bias with 1-sigma; sortable."""
     head = (
         "journey",
         "frames",
         "signs",
         "detections",
         "used",
-        "east",
-        "north",
-        "up",
+        "east [m]",
+        "north [m]",
+        "up [m]",
         "heading [deg]",
     )
     rows = []
@@ -137,8 +137,8 @@ def bias_table(journeys: Sequence[JourneySummary]) -> str:
         cells = [_cell(j.journey_id, j.journey_id), _cell(str(j.frames), j.frames)]
         cells += [_cell(f"{n:,}", n) for n in (j.signs, j.detections)]
         cells.append(_cell(_percent(share), share))
-        cells += [_cell(f"{b:+.3f}", b) for b in j.bias]
-        cells.append(_cell(f"{j.heading_deg:+.3f}", j.heading_deg))
+        cells += [_uncertain_cell(b, s) for b, s in zip(j.bias, j.bias_sigma, strict=True)]
+        cells.append(_uncertain_cell(j.heading_deg, j.heading_sigma_deg))
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return _sortable(head, rows)
 
@@ -256,6 +256,13 @@ def _cell(text: str, value: float | str, *, kind: str = "") -> str:
     key = "" if isinstance(value, float) and not math.isfinite(value) else str(value)
     name = f' class="{kind}"' if kind else ""
     return f'<td{name} data-v="{escape(key)}">{escape(text)}</td>'
+
+
+def _uncertain_cell(value: float, sigma: float) -> str:
+    """A signed number with its 1-sigma, where it is known."""
+    if not math.isfinite(value):
+        return _cell("-", value)
+    return _cell(f"{value:+.3f}" + (f" ± {sigma:.3f}" if math.isfinite(sigma) else ""), value)
 
 
 def _is_word(text: str) -> bool:

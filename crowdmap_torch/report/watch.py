@@ -85,7 +85,7 @@ class Watch:
     def _errors(self, bundle: Bundle, *, with_lanes: bool) -> dict[str, float]:
         if self._survey is None or not len(self._signs):
             return {}
-        signs, lanes, _ = adjust.read_map(bundle, self._signs, self._lanes, covariance=False)
+        signs, lanes = adjust.read_map(bundle, self._signs, self._lanes)
         return progress_scalars(signs, self._survey, lanes=lanes if with_lanes else None)
 
 

@@ -7,19 +7,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from crowdmap_torch import residual_blocks, residuals
-from crowdmap_torch.bundle import AdjustConfig, Bundle, DriftNodes, PosePriorConfig
+from crowdmap_torch import residuals
+from crowdmap_torch.bundle import AdjustConfig, Bundle
 from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.lane_matching import LaneMatches, nearest_lanes
+from crowdmap_torch.map_uncertainty import MapUncertainty
 from crowdmap_torch.observations import (
     ControlPoints,
     LanePointObservations,
@@ -31,6 +31,7 @@ from crowdmap_torch.observations import (
 )
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm, Variable, euclidean, positive
+from crowdmap_torch.pose_prior import drift_nodes, pose_prior
 from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Signs
 
 
@@ -83,10 +84,12 @@ def build(
 
     journey = torch.searchsorted(torch.tensor(offsets[1:], device=frame.device), frame, right=True)
     way = torch.cat([station(journey.T_world_camera) for journey in journeys])[frame]
-    nodes = _drift_nodes(journey, way, config.drift_spacing_m)
+    nodes = drift_nodes(journey, way, config.drift_spacing_m)
+    at_nodes = drift[frame][nodes.first]
     values = {
         "pose": start[frame],
-        "drift": drift[frame][nodes.first],
+        "drift": at_nodes,
+        "bias": nodes.mean(at_nodes, len(journeys)),
         "sign": signs.T_world_sign,
         "size": signs.size,
         "lane": spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count),
@@ -94,12 +97,12 @@ def build(
     variables = {
         "pose": Variable(6, se3.retract),
         "drift": Variable(6, euclidean),
+        "bias": Variable(6, euclidean),
         "sign": Variable(6, se3.retract),
         "size": Variable(2, positive),
         "lane": Variable(3, euclidean),
     }
-    fixed = _pose_terms(journeys, prior[frame], nodes, config)
-    fixed.update(_lane_prior(values["lane"], lanes, config))
+    fixed = _lane_prior(values["lane"], lanes, config)
     if control is not None and len(control):
         fixed["control"] = _control_term(control, signs)
     tree = KDTree(values["pose"][:, :3, 3].cpu().numpy()) if len(frame) else None
@@ -116,7 +119,7 @@ def build(
         matches,
         lanes.control_count,
         frame,
-        nodes,
+        pose_prior(journeys, prior[frame], nodes, config.drift_spacing_m, config.prior),
         beside,
         config,
     )
@@ -184,87 +187,6 @@ def _lane_rows(
     return points[found], matches
 
 
-def _drift_nodes(
-    journey: Int[Tensor, " n"], way: Float[Tensor, " n"], spacing: float
-) -> DriftNodes:
-    """Stretches of at most `spacing` metres in which the drift is taken to stand still."""
-    cell = (way / spacing).floor()
-    begins = torch.ones_like(journey, dtype=torch.bool)
-    begins[1:] = (journey[1:] != journey[:-1]) | (cell[1:] != cell[:-1])
-    of_frame = begins.cumsum(0) - 1
-    first = torch.nonzero(begins)[:, 0]
-    count = torch.bincount(of_frame, minlength=len(first))
-    centre = way.new_zeros(len(first)).index_add_(0, of_frame, way) / count
-    return DriftNodes(of_frame, first, journey[first], centre)
-
-
-def _pose_terms(
-    journeys: Sequence[Journey],
-    prior: Float[Tensor, "n 4 4"],
-    nodes: DriftNodes,
-    config: AdjustConfig,
-) -> dict[str, CostTerm]:
-    """Absolute and relative regularisation of the poses (V-B, footnote).
-
-    A frame's error is a slow drift and white noise. The drift's stationary variance is that of bias and drift together,
-    and it loses memory at the rate that keeps the drift's short-range changes: one chain stands for both.
-    """
-    sigma, length = _drift_model(journeys, prior, config.prior)
-    white = prior.new_tensor(
-        [config.prior.white_sigma_m] * 3 + [math.radians(config.prior.white_sigma_deg)] * 3
-    )
-    # Within a stretch the drift does move: by a random walk of a quarter of its length in the mean.
-    rate = 2 * sigma.square() / length
-    white = (white.square() + rate * config.drift_spacing_m / 4).sqrt()
-    deviation = CostTerm(
-        residuals.pose_deviation,
-        (("pose", torch.arange(len(prior), device=prior.device)), ("drift", nodes.of_frame)),
-        (prior,),
-        1 / white[nodes.journey[nodes.of_frame]],
-        jacobian=residuals.pose_deviation_jacobian,
-        batched=residual_blocks.pose_deviation,
-        normal=residual_blocks.pose_deviation_blocks,
-    )
-    follows = torch.nonzero(nodes.journey[1:] == nodes.journey[:-1])[:, 0]
-    gap = (nodes.way[follows + 1] - nodes.way[follows]).clamp_min(0.1)[:, None]
-    total, reach = sigma[nodes.journey[follows]], length[nodes.journey[follows]]
-    transition = CostTerm(
-        residuals.drift_transition,
-        (("drift", follows), ("drift", follows + 1)),
-        (torch.exp(-gap / reach),),
-        1 / (total * (-torch.expm1(-2 * gap / reach)).sqrt()),
-        jacobian=residuals.drift_transition_jacobian,
-    )
-    begins = torch.ones_like(nodes.journey, dtype=torch.bool)
-    begins[1:] = nodes.journey[1:] != nodes.journey[:-1]
-    first = torch.nonzero(begins)[:, 0]
-    start = CostTerm(
-        residuals.drift_start, (("drift", first),), (), 1 / sigma[nodes.journey[first]]
-    )
-    return {"pose_absolute": start, "pose_relative": transition, "pose_white": deviation}
-
-
-def _drift_model(
-    journeys: Sequence[Journey], prior: Tensor, config: PosePriorConfig
-) -> tuple[Float[Tensor, "j 6"], Float[Tensor, "j 6"]]:
-    """Stationary sigma and correlation length of each journey's drift chain, position then rotation."""
-    drift = prior.new_tensor([config.drift_sigma_m] * 3)
-    angle = math.radians(config.rotation_sigma_deg)
-    sigmas, lengths = [], []
-    for journey in journeys:
-        total = (drift.square() + prior.new_tensor(config.bias_sigma_m).square()).sqrt()
-        if journey.sigma_position is not None:
-            total = torch.maximum(journey.sigma_position.to(prior).median(0).values, drift)
-        turn = prior.new_tensor(angle)
-        if journey.sigma_rotation is not None:
-            turn = journey.sigma_rotation.to(prior).median().clamp_min(angle / 10)
-        sigmas.append(torch.cat((total, turn.expand(3))))
-        # Same change over a short way: sigma^2 / length is that of the drift alone.
-        length = config.drift_length_m * (total / drift).square()
-        lengths.append(torch.cat((length, prior.new_tensor([config.rotation_length_m] * 3))))
-    return torch.stack(sigmas), torch.stack(lengths)
-
-
 def _control_term(control: ControlPoints, signs: Signs) -> CostTerm:
     """Surveyed centres of signs; a sign's centre is the mean of its corners."""
     shape = signs.shape[control.sign]
@@ -320,7 +242,7 @@ def read_poses(bundle: Bundle, journeys: Sequence[Journey]) -> tuple[Float[Tenso
     values = bundle.values()
     offsets = frame_offsets(journeys)
     poses = []
-    nodes = bundle.nodes
+    nodes = bundle.prior.nodes
     for number, (journey, a, b) in enumerate(zip(journeys, offsets, offsets[1:], strict=False)):
         mine = torch.nonzero((bundle.frame >= a) & (bundle.frame < b))[:, 0]
         if not len(mine):
@@ -343,30 +265,14 @@ def read_poses(bundle: Bundle, journeys: Sequence[Journey]) -> tuple[Float[Tenso
 
 @torch.no_grad()
 def read_map(
-    bundle: Bundle, signs: Signs, lanes: Lanes, *, covariance: bool = True
-) -> tuple[Signs, Lanes, Float[Tensor, "3 3"]]:
-    """Adjusted signs and lanes with their absolute covariances, and the part that the whole map shares."""
+    bundle: Bundle, signs: Signs, lanes: Lanes, uncertainty: MapUncertainty | None = None
+) -> tuple[Signs, Lanes]:
+    """Adjusted signs and lanes, with the covariances of `uncertainty` where it is given."""
     values = bundle.values()
-    control = spline_basis.from_coefficients_flat(values["lane"], lanes.control_count)
+    point = spline_basis.from_coefficients_flat(values["lane"], lanes.control_count)
     signs = replace(signs, T_world_sign=values["sign"], size=values["size"])
-    lanes = replace(lanes, control=replace(lanes.control, point_world=control))
-    shared = torch.zeros(3, 3, dtype=control.dtype, device=control.device)
-    if not covariance:
-        return signs, lanes, shared
-    normal = bundle.backend().assemble(bundle.problem(held=False), values)
-    joint = normal.marginal_covariance()
-    offset = normal.structure.where.offset
-    xyz = torch.arange(3, device=control.device)
-    at = offset["sign"][:, None] + xyz
-    if len(signs):
-        signs = replace(signs, covariance=joint[at[:, :, None], at[:, None, :]])
-        shared = joint[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
-    at = offset["lane"][:, None] + xyz
-    if len(lanes):
-        blocks = joint[at[:, :, None], at[:, None, :]]
-        axes = bundle.fixed["lane_prior"].constants[1]
-        across = (axes[:, :, 1][:, None] @ blocks @ axes[:, :, 1][..., None])[:, 0, 0]
-        lanes = replace(lanes, control=replace(lanes.control, sigma=across.clamp_min(0).sqrt()))
-        if not len(signs):
-            shared = joint[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
-    return signs, lanes, (shared + shared.mT) / 2
+    control = replace(lanes.control, point_world=point)
+    if uncertainty is not None:
+        signs = replace(signs, covariance=uncertainty.center)
+        control = replace(control, sigma=uncertainty.lane_sigma)
+    return signs, replace(lanes, control=control)

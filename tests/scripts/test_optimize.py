@@ -185,6 +185,29 @@ def test_metrics_tell_counts_times_costs_and_figures(run: Path):
     assert metrics["survey_clusters"] is not None
 
 
+def test_metrics_tell_how_sure_corners_and_biases_are(run: Path):
+    metrics = json.loads((run / "metrics.json").read_text())
+    signs = {
+        row["sign_id"]: row for row in pq.read_table(run / "map" / "signs.parquet").to_pylist()
+    }
+    corners = {row["sign_id"]: row["covariance"] for row in metrics["sign_corners"]}
+    assert set(signs) <= set(corners)
+    for name, sign in signs.items():
+        assert len(corners[name]) == len(sign["corners"])
+        of_corner = torch.tensor(corners[name]).view(-1, 3, 3)
+        of_center = torch.tensor(sign["covariance"]).view(3, 3)
+        # A corner is never known better than by what the centre's bias leaves: here decimetres.
+        assert (of_corner.diagonal(dim1=1, dim2=2).sum(1) > 0.9 * of_center.trace()).all()
+    for journey in metrics["journeys"]:
+        covariance = torch.tensor(journey["bias_covariance"]).view(3, 3)
+        assert (torch.linalg.eigvalsh(covariance) > 0).all()
+        # The module's own sigma is 0.4 m, and three journeys share what nobody can tell.
+        assert (covariance.diagonal().sqrt() > 0.1).all() and covariance.trace() < 1.0
+        assert 0 < journey["heading_sigma_deg"] < 0.2
+        assert abs(journey["heading_deg"]) < 5 * journey["heading_sigma_deg"]
+        assert set(journey["sigma_scale"]) == {"bias", "drift", "rotation"}
+
+
 def test_the_report_needs_nothing_else(run: Path):
     html = (run / "report.html").read_text(encoding="utf-8")
     assert "<svg" in html and "<script src" not in html and 'href="http' not in html

@@ -1,0 +1,123 @@
+"""How sure an adjusted map is: covariances of signs, their corners, lanes and journeys' errors, from one factorisation.
+
+The covariance of the landmarks is the inverse of the reduced system that bundle adjustment solves, poses and biases
+marginalised; what all positions share is kept apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch.bundle import Bundle
+from crowdmap_torch.geometry import polygon, se3, spline_basis
+from crowdmap_torch.tables import Lanes, Signs
+
+
+@dataclass(frozen=True)
+class MapUncertainty:
+    """Covariances of an adjusted map, absolute: what all positions share included."""
+
+    center: Float[Tensor, "n 3 3"]
+    """Of the signs' centres [m^2]."""
+    corner: Float[Tensor, "n 8 3 3"]
+    """Of the signs' corners, in the order of FORMAT.md [m^2]."""
+    lane_sigma: Float[Tensor, " c"]
+    """1-sigma of the lateral position at the lanes' control points [m]."""
+    shared: Float[Tensor, "3 3"]
+    """Mean covariance between any two positions [m^2]."""
+    bias: Float[Tensor, "j 4"]
+    """By journey the mean error of its poses along the way, the adjusted minus the given ones: east, north, up [m] and
+    heading [rad], counted from east to north. NaN for journeys that had no say."""
+    bias_covariance: Float[Tensor, "j 4 4"]
+
+
+@torch.no_grad()
+def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertainty:
+    """Covariances at the bundle's values; `signs` and `lanes` are those that it was built from."""
+    values = bundle.values()
+    nodes = bundle.prior.nodes
+    journeys = len(values["bias"])
+    normal = bundle.backend().assemble(bundle.problem(held=False), values)
+    to_bias = _to_bias(values["pose"][nodes.first])
+    count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)
+    found = normal.covariances(to_bias.mT / count[nodes.journey, None, None])
+    assert found.sums is not None
+    joint, offset = found.landmarks, normal.inner.structure.where.offset
+    sign = torch.cat(
+        [
+            offset[name][:, None]
+            + torch.arange(bundle.variables[name].tangent_dim, device=count.device)
+            for name in ("sign", "size")
+        ],
+        dim=1,
+    )
+    of_sign = joint[sign[:, :, None], sign[:, None, :]]
+    lane = offset["lane"][:, None] + torch.arange(3, device=count.device)
+    at = sign[:, :3] if len(signs) else lane
+    shared = joint.new_zeros(3, 3)
+    if len(at):
+        shared = joint[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
+    bias = (to_bias @ values["drift"][..., None])[..., 0]
+    bias = nodes.mean(bias, journeys)
+    own = torch.arange(journeys, device=count.device)
+    of_bias = found.sums.view(journeys, 4, journeys, 4)[own, :, own]
+    silent = count == 0
+    return MapUncertainty(
+        center=of_sign[:, :3, :3],
+        corner=_corner_covariance(values["sign"], values["size"], signs, of_sign),
+        lane_sigma=_lane_sigma(bundle, lanes, joint, lane),
+        shared=(shared + shared.mT) / 2,
+        bias=bias.masked_fill(silent[:, None], torch.nan),
+        bias_covariance=of_bias.masked_fill(silent[:, None, None], torch.nan),
+    )
+
+
+def _to_bias(T_world_camera: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 6"]:
+    """What takes the error of a pose to that of its position and of its heading."""
+    matrix = T_world_camera.new_zeros(len(T_world_camera), 4, 6)
+    matrix[:, :3, :3] = torch.eye(3).to(matrix)
+    # The rotation is about the camera's axes; its part about world up is the heading.
+    matrix[:, 3, 3:] = T_world_camera[:, 2, :3]
+    return matrix
+
+
+def _corner_covariance(
+    T_world_sign: Float[Tensor, "n 4 4"],
+    size: Float[Tensor, "n 2"],
+    signs: Signs,
+    joint: Float[Tensor, "n 8 8"],
+) -> Float[Tensor, "n 8 3 3"]:
+    """Covariance of each corner from that of the sign's pose and size, corners in the order of FORMAT.md."""
+    T, canonical_size = polygon.canonical(T_world_sign, size, signs.shape)
+    corner_world = se3.transform(T[:, None], polygon.corners(signs.shape, canonical_size))
+    corner = se3.transform(se3.inverse(T_world_sign)[:, None], corner_world)
+    R = T_world_sign[:, None, :3, :3].expand(-1, corner.shape[1], 3, 3)
+    # By translation, by turning about the sign's axes (w x c), and by the relative change of its sides.
+    by_turn = -R @ se3.skew(corner)
+    by_size = R[..., :2] * corner[..., None, :2]
+    J = torch.cat((torch.eye(3).to(R).expand_as(R), by_turn, by_size), dim=-1)
+    return J @ joint[:, None] @ J.mT
+
+
+def _lane_sigma(
+    bundle: Bundle,
+    lanes: Lanes,
+    joint: Float[Tensor, "r r"],
+    place: Float[Tensor, "c 3"],
+) -> Float[Tensor, " c"]:
+    """1-sigma of every control point across its lane; a control point is a weighted sum of coefficients."""
+    if not len(lanes):
+        return joint.new_zeros(0)
+    count = lanes.control_count
+    spline, rank = spline_basis.rows(count)
+    start = spline_basis.starts(count)
+    row, weight, _ = spline_basis.window_flat(rank.to(joint), start[spline], count[spline])
+    across = bundle.fixed["lane_prior"].constants[1][:, :, 1]
+    at = place[row].flatten(1)
+    push = (weight[:, :, None] * across[:, None]).flatten(1)
+    variance = (push[:, None] @ joint[at[:, :, None], at[:, None]] @ push[..., None])[:, 0, 0]
+    return variance.clamp_min(0).sqrt()
