@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import types
 import typing
 from collections.abc import Mapping
@@ -69,16 +70,19 @@ class MapperConfig:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 
     def resolved(self) -> MapperConfig:
-        """The configuration with every stage's method set to the paper's, if that is the method of all."""
+        """The configuration with the paper's choices in every stage, if that is the method of all."""
         if self.method != "paper2017":
             return self
         return replace(
             self,
             sign_association=replace(self.sign_association, method="epipolar"),
             lane_association=replace(self.lane_association, method="epipolar"),
+            sign_triangulation=replace(self.sign_triangulation, method="paper2017"),
             road=replace(self.road, method="paper2017"),
             lane=replace(self.lane, method="paper2017"),
             crowd=replace(self.crowd, method="paper2017"),
+            # eq:ba weighs all pixels alike, and knows no road under its lanes.
+            adjust=replace(self.adjust, lane_height_sigma_m=math.inf, lane_correlation=1.0),
         )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs
-from crowdmap_torch.clustering.spectral import renumber, same_partition
+from crowdmap_torch.clustering.spectral import renumber
 from crowdmap_torch.crowd_signs import (
     CrowdSigns,
     enough_to_tell,
@@ -65,7 +65,7 @@ class CrowdConfig:
     """How the signs of many journeys are told apart and the journeys' biases found."""
 
     method: str = "joint"
-    """`joint`, or `paper2017`: the paper's clusters and mean biases, repeated until the clusters stand still."""
+    """`joint`, or `paper2017`: the paper's clusters of the places as they are, once, and the mean biases from them."""
     shift_sigmas_m: tuple[float, ...] = (0.45, 0.3, 0.2, 0.15)
     """`joint`: how uncertain the journeys' shifts are taken to be, coarse to fine, 1-sigma along each axis [m]."""
     least_sigma_m: tuple[float, float, float] = (0.25, 0.12, 0.06)
@@ -74,7 +74,7 @@ class CrowdConfig:
     The covariance from triangulation knows pixels, not how poses wander while a sign is in view.
     """
     rounds: int = 4
-    """Most alternations of clustering and alignment for each of these (`paper2017`: in all)."""
+    """`joint`: most alternations of clustering and alignment for each of these."""
     seed_journeys: int = 60
     """`joint`: most journeys that clusters are first made from in one place; the others' signs are matched to those."""
     seed_cell_m: float = 50.0
@@ -82,7 +82,7 @@ class CrowdConfig:
     stands_still: float = 0.001
     """`joint`: clusters stand still when at most this share of the signs changes."""
     min_journeys: int = 2
-    """Signs seen by fewer are singles, kept apart as tentative (of a single journey, its signs are the map)."""
+    """`joint`: signs seen by fewer are singles, kept apart as tentative (of a single journey, its signs are the map)."""
     cluster: SignClusterConfig = field(default_factory=SignClusterConfig)
     """Grouping from places alone."""
     match: SignMatchConfig = field(default_factory=SignMatchConfig)
@@ -171,27 +171,25 @@ def _associate_paper(crowd: CrowdSigns, config: CrowdConfig, generator: torch.Ge
     signs = crowd.signs
     cluster = replace(config.cluster, method="paper2017")
     align = replace(config.align, method="paper2017")
-    bias = no_bias(signs, crowd.station, align, journeys=crowd.journeys)
-    label = torch.full_like(signs.journey, -1)
-    rounds: list[CrowdRound] = []
-    spectra: tuple[Spectrum, ...] = ()
-    for _ in range(config.rounds):
-        found = cluster_signs(unbiased_signs(crowd, bias), cluster, generator=generator)
-        spectra = spectra or found.report.spectra
-        rounds.append(_round(0.0, label, found.label))
-        stands_still = same_partition(label, found.label)
-        label = found.label
-        if stands_still:
-            break
-        bias = align_journeys(
-            signs, label, crowd.station, align, start=bias, bias_sigma=crowd.bias_sigma
-        )
-    unbiased = unbiased_signs(crowd, bias)
-    heads = sign_heads(unbiased, label, method="paper2017")
+    found = cluster_signs(signs, cluster, generator=generator)
+    label = found.label
+    bias = align_journeys(
+        signs,
+        label,
+        crowd.station,
+        align,
+        start=no_bias(signs, crowd.station, align, journeys=crowd.journeys),
+        bias_sigma=crowd.bias_sigma,
+    )
+    heads = sign_heads(signs, label, method="paper2017")
     company = has_company(crowd, config.existence)
-    statistics = _statistics(crowd, unbiased, label, heads, bias, company)
+    statistics = _statistics(crowd, unbiased_signs(crowd, bias), label, heads, bias, company)
     weight = crowd.bias_sigma.new_ones(crowd.journeys)
-    return _finished(crowd, label, heads, bias, (), weight, rounds, spectra, statistics, config)
+    rounds = [_round(0.0, torch.full_like(label, -1), label)]
+    spectra = found.report.spectra
+    made = _finished(crowd, label, heads, bias, (), weight, rounds, spectra, statistics, config)
+    # Every cluster is in the map: the paper asks nobody who drove by and saw nothing.
+    return replace(made, heads=heads)
 
 
 def _associate_joint(crowd: CrowdSigns, config: CrowdConfig, generator: torch.Generator) -> Crowd:

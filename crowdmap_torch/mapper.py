@@ -214,13 +214,12 @@ def first_map(
         se3.local(journey.T_world_camera, start)
         for journey, start in zip(journeys, starts, strict=True)
     ]
-    pieces = concatenate_lanes(
-        [_moved(m.lanes, drift) for m, drift in zip(maps, drifts, strict=True)]
-    )
     if config.crowd.method == "paper2017":
+        pieces = concatenate_lanes([m.lanes for m in maps])
         lanes = cluster_lanes(pieces, config.lane_cluster, generator=generator).heads
     else:
-        lanes = join_lanes(pieces, config.lane_join).lanes
+        moved = [_moved(m.lanes, drift) for m, drift in zip(maps, drifts, strict=True)]
+        lanes = join_lanes(concatenate_lanes(moved), config.lane_join).lanes
     members = unbiased_signs(gathered, crowd.bias)
     associations = tuple(
         _sign_association(journey, m, members, crowd, number)
@@ -253,6 +252,7 @@ def build_bundle(
     control: SurveySigns | None = None,
 ) -> Bundle:
     """Section V-B: the unknowns and observations of bundle adjustment; signs that are in `control` pin the map."""
+    config = config.resolved()
     return adjust.build(
         journeys,
         [m.road for m in maps],

@@ -22,6 +22,7 @@ from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.camera import project
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.band import BandBackend, BandNormalEquations
+from crowdmap_torch.optim.linear import DenseBackend
 from crowdmap_torch.optim.linearize import residuals as rows_of_term
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
 from crowdmap_torch.optim.robust import Tukey
@@ -71,6 +72,8 @@ class SignFitConfig:
     """What the car's course says of it."""
     tukey: float = 2.8
     """Detections with a root mean square whitened error beyond this many standard deviations have no say."""
+    tukey_alone: float = 4.685
+    """The same of signs fitted one by one, whose residuals hold the errors of the poses too."""
     typical_size_m: float = 0.75
     """Median width and height of signs."""
     sigma_log_size: float = 0.8
@@ -206,6 +209,47 @@ def fit_signs(
     return _read(
         normal, views, start, at_knots, scale, drive, _mean_square(whitened, shape, views), config
     )
+
+
+def fit_signs_alone(
+    views: SignViews,
+    shape: Int[Tensor, " n"],
+    start: SignStart,
+    facing: Float[Tensor, "n 3"],
+    drive: DrivePath,
+    config: SignFitConfig,
+) -> SignFit:
+    """Signs one by one, the poses taken as they are: the paper's minimisation (IV-B).
+
+    What is wrong with the poses is in the residuals: the scale of Tukey's weights is that of each sign's own, from
+    those of the start on.
+    """
+    exact = replace(config, pose_sigma_m=0.0, pose_sigma_rad=0.0, tukey=config.tukey_alone)
+    nothing = start.size.new_zeros(len(views), 6)
+
+    def at(found: SignStart, scale: Tensor) -> tuple[Problem, dict[str, Tensor]]:
+        given = views.T_world_camera
+        noise = _noise(views, given, shape, found, nothing, scale, nothing[:, :2], exact)
+        return _problem(views, shape, found, noise, facing, exact)
+
+    def spread(error_sq: Tensor) -> Tensor:
+        return robust_noise_scale(error_sq, views.sign, len(shape), torch.inf)
+
+    problem, values = at(start, torch.ones_like(start.size[:, 0]))
+    error_sq = _mean_square(_whitened(problem, values, shape, views), shape, views)
+    scale = spread(error_sq)
+    for _ in range(config.rounds):
+        problem, values = at(SignStart(values["sign"], values["size"]), scale)
+        values = lm.solve(problem, values, config.lm).values
+        error_sq = _mean_square(_whitened(problem, values, shape, views), shape, views)
+        scale = torch.minimum(scale, spread(error_sq * scale[views.sign].square()))
+    found = SignStart(values["sign"], values["size"])
+    away = distance_away(views, found)
+    frame = closest_approach(
+        drive, found.T_world_sign[:, :3, 3], views.frame[closest_view(away, views.sign)]
+    )
+    covariance = DenseBackend().assemble(problem, values).covariance()[:, :3, :3]
+    return SignFit(found.T_world_sign, found.size, frame, covariance, error_sq, 0.0)
 
 
 def fit_signs_coarsely(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,10 +113,8 @@ def test_methods_of_the_paper_reach_every_stage():
         if isinstance(part, dict) and "method" in part
     }
     assert methods.pop("sign_association") == methods.pop("lane_association") == "epipolar"
-    # Of the stages that the mapper runs with this method; lanes are joined by cluster_lanes instead.
-    for name in ("lane_join", "lane_cluster", "sign_triangulation"):
-        methods.pop(name, None)
     assert methods and set(methods.values()) == {"paper2017"}
+    assert config.adjust.lane_height_sigma_m == math.inf
 
 
 def test_our_method_leaves_the_stages_alone():

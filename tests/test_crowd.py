@@ -12,7 +12,7 @@ from crowdmap_torch.clustering.spectral import same_partition
 from crowdmap_torch.crowd import CrowdConfig, associate_crowd, unbiased_signs
 from crowdmap_torch.crowd_signs import pairs_seen_together
 from crowdmap_torch.similarity import mahalanobis
-from crowdmap_torch.stages.cluster import moved
+from crowdmap_torch.stages.cluster import SignClusterConfig, cluster_signs, moved
 from crowdmap_torch.stages.existence import ExistenceConfig, existence
 from crowdmap_torch.stages.suspects import SuspectConfig, suspect_journeys
 
@@ -169,6 +169,26 @@ def test_paper_method_runs_as_a_whole():
     _, recall = pair_scores(world, crowd.label)
     # The paper's rounds merge the signs of a post at 0.7 m, yet they find the posts.
     assert recall > 0.9
+    assert bool((crowd.heads.confidence == 1).all())
+
+
+def test_paper_clusters_places_as_they_are_and_averages_their_corners():
+    world = make_world(12, journeys=6, bias_m=0.3)
+    signs = world.crowd.signs
+    crowd = associate_crowd(world.crowd, CrowdConfig(method="paper2017"))
+    assert len(crowd.report.rounds) == 1
+    found = cluster_signs(
+        signs,
+        SignClusterConfig(method="paper2017"),
+        generator=torch.Generator().manual_seed(0),
+    )
+    assert torch.equal(crowd.label, found.label)
+    for c in range(len(crowd.heads)):
+        mine = crowd.label == c
+        if int((signs.shape[mine] != signs.shape[mine][0]).sum()) == 0:
+            mean = signs.center_world[mine].mean(0)
+            # A plane of the sign's outline through mean corners that are not quite of that outline.
+            assert (crowd.heads.center_world[c] - mean).norm() < 0.03
 
 
 def test_same_generator_gives_the_same_crowd():

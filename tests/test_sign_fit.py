@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from drives import make_journey
@@ -19,6 +21,7 @@ from crowdmap_torch.sign_fit import (
     SignViews,
     closest_approach,
     fit_signs,
+    fit_signs_alone,
     fit_signs_coarsely,
     robust_noise_scale,
 )
@@ -233,6 +236,40 @@ def test_errors_are_as_large_as_the_covariance_says():
     assert float(z[:, :3].mean(0).abs().max()) < 0.3
 
 
+def test_signs_fitted_alone_are_exact_where_poses_are(generator):
+    centers = [(3.5 * (-1) ** i, 50.0 + 3.0 * i, 2.0 + 0.2 * i) for i in range(6)]
+    drive = drive_past(straight_poses(60), signs_at(centers, yaw_deg=10.0), shape=list(range(6)))
+    path = path_of(drive.journey.T_world_camera)
+    start, views = start_of(drive, generator), views_of(drive)
+    found = fit_signs_alone(views, drive.shape, start, facing(6), path, CONFIG)
+    error = se3.transform(found.T_world_sign[:, None], polygon.corners(drive.shape, found.size))
+    assert float((error - drive.corners_world).norm(dim=-1).max()) < 0.005
+
+
+def test_signs_fitted_alone_take_drift_for_parallax(generator):
+    """Positions that lag by a hundredth of the way make a stretched drive, and signs on it further on."""
+    drive = drive_past(straight_poses(60), signs_at([(3.5, 60.0, 2.5)]))
+    poses = drive.journey.T_world_camera.clone()
+    poses[:, 1, 3] *= 1.01
+    views = views_of(drive)
+    views = replace(views, T_world_camera=poses[views.frame])
+    start = start_of(drive, generator, push=0.02)
+    found = fit_signs_alone(views, drive.shape, start, facing(1), path_of(poses), CONFIG)
+    assert found.T_world_sign[0, 1, 3] - drive.T_world_sign[0, 1, 3] == pytest.approx(0.6, abs=0.1)
+
+
+def test_signs_fitted_alone_have_no_gross_outliers(generator):
+    drive = drive_past(straight_poses(60), signs_at([(3.5, 60.0, 2.5)]), noise_px=0.3)
+    views, path = views_of(drive), path_of(drive.journey.T_world_camera)
+    start = start_of(drive, generator, push=0.02)
+    clean = fit_signs_alone(views, drive.shape, start, facing(1), path, CONFIG)
+    bad = pushed(views, 40.0)
+    robust = fit_signs_alone(bad, drive.shape, start, facing(1), path, CONFIG)
+    offset = robust.T_world_sign[:, :3, 3] - clean.T_world_sign[:, :3, 3]
+    # A tenth of the views are missing: less than a fifth of the standard deviation.
+    assert float(offset.norm()) < 0.2 * float(clean.covariance[0].trace().sqrt())
+
+
 def test_signs_of_one_stretch_hold_each_other(generator):
     centers = [(3.5 * (-1) ** i, 50.0 + 8.0 * i, 2.5) for i in range(6)]
     drive, given, views = noisy_drive(centers, generator)
@@ -273,20 +310,23 @@ def test_the_closest_approach_is_the_last_frame_that_has_the_sign_in_its_image()
     assert closest_approach(short, centre, torch.tensor([last - 12])).tolist() == [last - 6]
 
 
+def pushed(views: SignViews, by_px: float) -> SignViews:
+    """The same views, every tenth of them moved in the image."""
+    px = views.corners_px.clone()
+    px[::10] += by_px
+    ideal, _ = cameras.unproject(CAMERA, px)
+    return replace(
+        views,
+        corners_px=px,
+        corners_ideal=ideal,
+        observation=cameras.observation_matrix(CAMERA, px, ideal),
+    )
+
+
 def test_gross_outliers_have_no_say(generator):
     drive = drive_past(straight_poses(60), signs_at([(3.5, 60.0, 2.5)]), noise_px=0.3)
     views, one = views_of(drive), torch.ones(1, dtype=F64)
-    px = views.corners_px.clone()
-    px[::10] += 40.0
-    ideal, _ = cameras.unproject(CAMERA, px)
-    bad = SignViews(
-        **{
-            **views.__dict__,
-            "corners_px": px,
-            "corners_ideal": ideal,
-            "observation": cameras.observation_matrix(CAMERA, px, ideal),
-        }
-    )
+    bad = pushed(views, 40.0)
     keep = torch.ones(len(views), dtype=torch.bool)
     keep[::10] = False
     start = start_of(drive, generator, push=0.02)

@@ -20,12 +20,15 @@ from crowdmap_torch.sign_fit import (
     SignViews,
     distance_away,
     fit_signs,
+    fit_signs_alone,
     fit_signs_coarsely,
     robust_noise_scale,
 )
 from crowdmap_torch.sign_rejoin import RejoinConfig, rejoin, relabelled
 from crowdmap_torch.sign_start import against_the_drive, centre_points, starts
 from crowdmap_torch.tables import Journey, Signs, Tracklets, concatenate
+
+METHODS = ("joint", "paper2017")
 
 REASONS = (
     "kept",
@@ -46,6 +49,9 @@ KEPT, FEW_FRAMES, NO_PARALLAX, TOO_FAR, BEHIND, RESIDUAL, UNCERTAIN, SIZE, REJOI
 class SignTriangulationConfig:
     """How tracklets become signs, and which do not (IV-B)."""
 
+    method: str = "joint"
+    """`joint`: all signs and the drift of the poses as one problem, several starts, fragments rejoined. `paper2017`: each
+    sign by itself from its best plane, poses taken as they are."""
     min_frames: int = 3
     """Tracklets with fewer detections of the tracklet's shape are pruned."""
     min_parallax_deg: float = 0.7
@@ -53,7 +59,7 @@ class SignTriangulationConfig:
     max_distance_m: float = 80.0
     """Tracklets whose closest view is further away are pruned."""
     max_noise_scale: float = 3.9
-    """Tracklets whose views are noisier, as a multiple of the noise expected, are pruned."""
+    """`joint`: tracklets whose views are noisier, as a multiple of the noise expected, are pruned."""
     min_inlier_share: float = 0.5
     """Tracklets of whose views fewer agree with the sign are pruned."""
     max_sigma_m: float = 1.5
@@ -70,13 +76,18 @@ class SignTriangulationConfig:
     confident_frames: float = 4.0
     """Views in agreement, weighted by their scores, at which the confidence reaches 1 - 1/e."""
     start_yaw_deg: tuple[float, ...] = (-30.0, 30.0)
-    """Angles from the line of sight to start from, beside the best plane."""
+    """`joint`: angles from the line of sight to start from, beside the best plane."""
     start_views: int = 16
-    """Views of each sign that the starts are compared on."""
+    """`joint`: views of each sign that the starts are compared on."""
     rejoin: RejoinConfig = field(default_factory=RejoinConfig)
-    """When tracklets are put together again after a gap."""
+    """`joint`: when tracklets are put together again after a gap."""
     fit: SignFitConfig = field(default_factory=SignFitConfig)
     """The minimisation."""
+
+    def __post_init__(self) -> None:
+        """Refuses an unknown method."""
+        if self.method not in METHODS:
+            raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 
 
 @dataclass(frozen=True)
@@ -113,6 +124,44 @@ def triangulate_signs(
     rows = rows[reason[tracklets.label[rows]] == KEPT]
     if not len(rows):
         return _no_signs(journey), SignReport(reason, tracklets, _per_detection(journey))
+    fit_method = _fit_alone if config.method == "paper2017" else _fit_jointly
+    fitted = fit_method(journey, tracklets, shape, rows, config)
+    label, views, fit = fitted.label, fitted.views, fitted.fit
+    reason[fitted.rejoined] = REJOINED
+    fate = _fates(views, fit, fitted.noise_scale, config)
+    reason[label] = fate
+    kept = fate == KEPT
+    signs, turn = _signs(journey, fitted.rows, views, fit, shape[label], label, config)
+    error_sq = _per_detection(journey).index_put((fitted.rows,), fit.error_sq)
+    tracklets = _turned(journey, fitted.tracklets, shape, label, turn)
+    return signs[kept], SignReport(reason, tracklets, error_sq)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """Tracklets with the signs fitted to them."""
+
+    tracklets: Tracklets
+    """As given, or with some of them put together."""
+    rejoined: Int[Tensor, " k"]
+    """Labels that were given up for those of others."""
+    label: Int[Tensor, " n"]
+    """Tracklet of each sign."""
+    rows: Int[Tensor, " m"]
+    """Detection of each view."""
+    views: SignViews
+    fit: SignFit
+    noise_scale: Float[Tensor, " n"]
+    """By how much the noise of each sign's views exceeds what is usual."""
+
+
+def _fit_jointly(
+    journey: Journey,
+    tracklets: Tracklets,
+    shape: Int[Tensor, " count"],
+    rows: Int[Tensor, " m"],
+    config: SignTriangulationConfig,
+) -> _Fitted:
     label, sign = tracklets.label[rows].unique(return_inverse=True)
     views = _views(journey, tracklets, rows, sign)
     drive = drive_path(journey, config.fit.course, config.fit.drift)
@@ -122,8 +171,8 @@ def triangulate_signs(
     t_s = (journey.t_ns - journey.t_ns[0]).to(fit.size) * 1e-9
     group = rejoin(views, t_s[views.frame], fit, shape[label], config.rejoin)
     joined = group != torch.arange(len(label), device=group.device)
+    given_up = label[joined]
     if bool(joined.any()):
-        reason[label[joined]] = REJOINED
         tracklets = replace(tracklets, label=relabelled(tracklets, journey, label, group))
         # Second detections of a frame stay with the tracklet that is given up.
         still = tracklets.label[rows] == label[group][views.sign]
@@ -135,14 +184,26 @@ def triangulate_signs(
         )
         start, scale = _begin_again(views, again, shape[label], start, scale, ~joined, config)
         fit = _fit(views, shape[label], start, scale, drive, config)
+    return _Fitted(tracklets, given_up, label, rows, views, fit, scale)
 
-    fate = _fates(views, fit, scale, config)
-    reason[label] = fate
-    kept = fate == KEPT
-    signs, turn = _signs(journey, rows, views, fit, shape[label], label, config)
-    error_sq = _per_detection(journey).index_put((rows,), fit.error_sq)
-    tracklets = _turned(journey, tracklets, shape, label, turn)
-    return signs[kept], SignReport(reason, tracklets, error_sq)
+
+def _fit_alone(
+    journey: Journey,
+    tracklets: Tracklets,
+    shape: Int[Tensor, " count"],
+    rows: Int[Tensor, " m"],
+    config: SignTriangulationConfig,
+) -> _Fitted:
+    label, sign = tracklets.label[rows].unique(return_inverse=True)
+    views = _views(journey, tracklets, rows, sign)
+    drive = drive_path(journey, config.fit.course, config.fit.drift)
+    centre = centre_points(views, len(label), typical_height_m=config.fit.typical_size_m)
+    # The last is the best plane through the mid-points of the corners, or an upright sign where they have none.
+    best = starts(views, shape[label], centre, yaws=(0.0,), size_limits=config.size_m)[-1]
+    facing = against_the_drive(views, len(label))
+    fit = fit_signs_alone(views, shape[label], best, facing, drive, config.fit)
+    usual = torch.ones_like(fit.size[:, 0])
+    return _Fitted(tracklets, label[:0], label, rows, views, fit, usual)
 
 
 def _shape_by_vote(journey: Journey, tracklets: Tracklets) -> Int[Tensor, " count"]:

@@ -156,6 +156,35 @@ def test_a_small_far_plane_is_turned_the_right_way():
         assert float(torch.rad2deg(cosine.acos())) < 10.0
 
 
+def test_the_paper_fits_each_sign_by_itself(street):
+    config = SignTriangulationConfig(method="paper2017")
+    tracklets = by_truth(street)
+    every, _ = triangulate_signs(street.journey, tracklets, config)
+    assert len(every) == len(ALL_SHAPES)
+    # Noise of half a pixel and exact poses: a few centimetres along the line of sight.
+    assert float(corner_errors(every, street).max()) < 0.15
+    odd = (street.sign % 2 == 1).nonzero()[:, 0]
+    few = with_rows(street, odd)
+    alone, _ = triangulate_signs(few.journey, by_truth(few), config)
+    torch.testing.assert_close(alone.T_world_sign, every.T_world_sign[1::2], rtol=0, atol=1e-6)
+
+
+def test_the_paper_does_not_rejoin_tracklets():
+    drive = drive_past(straight_poses(80), signs_at([(3.5, 70.0, 2.2)]))
+    frame = drive.journey.signs.frame
+    drive = with_rows(drive, ((frame < 25) | (frame > 60)).nonzero()[:, 0])
+    tracklets = associate_signs(drive.journey, SignAssociationConfig(window_frames=15))
+    config = SignTriangulationConfig(method="paper2017", max_sigma_m=5.0)
+    signs, report = triangulate_signs(drive.journey, tracklets, config)
+    assert len(signs) == tracklets.count == 2
+    assert not bool((report.reason == REJOINED).any())
+
+
+def test_an_unknown_method_is_refused():
+    with pytest.raises(ValueError, match="method: expected one of"):
+        SignTriangulationConfig(method="best")
+
+
 def test_few_frames_are_pruned_and_counted(street):
     few = (street.journey.signs.frame < 2).nonzero()[:, 0]
     signs, report = mapped(with_rows(street, few).journey)
