@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from crowdmap_torch.studies.chapter import Chapter, write_chapters
+from crowdmap_torch.studies.chapter import Chapter, Table, write_chapters
 from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.numbers import seconds
 from crowdmap_torch.studies.scale import FULL, QUICK, Scale
-from crowdmap_torch.studies.tasks import Task, open_tasks, run_tasks
+from crowdmap_torch.studies.tasks import Task, finished_keys, open_tasks, run_tasks
 
 INTERRUPTED = "stopped; what is done is kept, and the same command goes on from there"
 
@@ -72,8 +73,32 @@ def run_studies(name: str, studies: Sequence[Study], options: argparse.Namespace
         except KeyboardInterrupt:
             sys.stderr.write(f"\n{INTERRUPTED}\n")
     chapters = [study.chapter(settings, folder) for study in studies]
+    chapters.append(time_chapter(studies, settings, folder))
     title = studies[0].title if len(studies) == 1 else "Studies"
     print(write_chapters(folder.path, name, title, chapters))
     left = len(open_tasks(tasks, folder))
     if left:
         print(f"{left} pieces of work are not done yet")
+
+
+def time_chapter(studies: Sequence[Study], settings: Settings, folder: StudyFolder) -> Chapter:
+    """What the work of each study took."""
+    rows, every = [], set()
+    for study in studies:
+        keys = finished_keys((task for _, task in study.tasks(settings)), folder)
+        every |= set(keys)
+        rows.append((study.title, len(keys), _minutes(keys, folder)))
+    rows.append(("all, shared work once", len(every), _minutes(every, folder)))
+    return Chapter(
+        "times",
+        "Times",
+        text=(
+            "Minutes of a core for mapping, without simulating and measuring. Studies share work: each has all that it "
+            "rests on counted as its own.",
+        ),
+        tables=(Table("times", ("study", "results", "minutes of a core"), tuple(rows)),),
+    )
+
+
+def _minutes(keys: Iterable[str], folder: StudyFolder) -> float:
+    return seconds([folder.read_result(key) for key in keys]) / 60

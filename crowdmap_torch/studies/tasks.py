@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
@@ -229,8 +229,19 @@ class MeasureReal:
         folder.write_result(self.key, {**measured, "frames": frames, "seconds": seconds})
 
 
-def open_tasks(tasks: Sequence[Task], folder: StudyFolder) -> list[Task]:
+def open_tasks(tasks: Iterable[Task], folder: StudyFolder) -> list[Task]:
     """What is not done yet of `tasks` and of all that they need, each once, needs first."""
+    return _with_needs(tasks, lambda task: task.is_done(folder))
+
+
+def finished_keys(tasks: Iterable[Task], folder: StudyFolder) -> list[str]:
+    """Keys of the results that there are of `tasks` and of all that they need, each once."""
+    every = _with_needs(tasks, lambda task: False)
+    return [task.key for task in every if folder.has_result(task.key)]
+
+
+def _with_needs(tasks: Iterable[Task], is_left_out: Callable[[Task], bool]) -> list[Task]:
+    """`tasks` and all that they need, each once, needs first; what is left out needs nothing."""
     found: dict[str, Task] = {}
     seen: set[str] = set()
 
@@ -238,7 +249,7 @@ def open_tasks(tasks: Sequence[Task], folder: StudyFolder) -> list[Task]:
         if task.key in seen:
             return
         seen.add(task.key)
-        if task.is_done(folder):
+        if is_left_out(task):
             return
         for need in task.needs():
             visit(need)

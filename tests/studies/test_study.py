@@ -69,7 +69,7 @@ def test_the_page_has_a_section_for_every_study(quick: Quick):
     assert quick.code == 0
     page = Sections()
     page.feed((quick.folder / "all.html").read_text(encoding="utf-8"))
-    assert page.ids == page.links == {study.name for study in every.STUDIES}
+    assert page.ids == page.links == {study.name for study in every.STUDIES} | {"times"}
 
 
 def test_every_study_has_a_table_and_a_plot(quick: Quick):
@@ -79,6 +79,17 @@ def test_every_study_has_a_table_and_a_plot(quick: Quick):
         assert rows, name
         assert all(len(row) == len(heading) for row in rows), name
         assert (quick.folder / "plots" / f"{name}.png").read_bytes().startswith(b"\x89PNG"), name
+
+
+def test_times_are_those_of_the_work_that_a_study_rests_on(quick: Quick):
+    with (quick.folder / "tables" / "times.csv").open(encoding="utf-8") as file:
+        _, *rows = csv.reader(file)
+    minutes = {name: float(spent) for name, _, spent in rows}
+    total = minutes.pop("all, shared work once")
+    assert set(minutes) == {study.title for study in every.STUDIES}
+    # The second figure of the paper is drawn from the maps of the first.
+    assert max(minutes.values()) < total < sum(minutes.values())
+    assert minutes["Data loss"] > 0 and minutes["Real drives"] == 0
 
 
 def test_our_map_of_the_quick_street_is_near_the_oracle(quick: Quick):
