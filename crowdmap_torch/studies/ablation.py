@@ -17,13 +17,6 @@ from crowdmap_torch.studies.tasks import MeasureMap, Task
 OURS = MapperConfig()
 
 
-def _without_drift(config: MapperConfig) -> MapperConfig:
-    fit = config.sign_triangulation.fit
-    # A hundredth of the usual drift is none.
-    still = replace(fit, drift=replace(fit.drift, scales=(0.01,)))
-    return replace(config, sign_triangulation=replace(config.sign_triangulation, fit=still))
-
-
 def _adjusted_with(**changes: float) -> MapperConfig:
     return replace(OURS, adjust=replace(OURS.adjust, **changes))
 
@@ -35,7 +28,9 @@ VARIANTS: Mapping[str, MapperConfig] = {
         sign_association=replace(OURS.sign_association, method="epipolar"),
         lane_association=replace(OURS.lane_association, method="epipolar"),
     ),
-    "signs without drift of the poses": _without_drift(OURS),
+    "signs one by one, poses as they are": replace(
+        OURS, sign_triangulation=replace(OURS.sign_triangulation, method="paper2017")
+    ),
     "road normal from calibration": replace(OURS, road=replace(OURS.road, method="calibration")),
     "lanes on one plane a frame": replace(OURS, lane=replace(OURS.lane, method="paper2017")),
     "clusters and biases of the paper": replace(
