@@ -36,7 +36,10 @@ class MapperConfig:
     """Everything that can be set; a YAML file names only what differs from the defaults."""
 
     method: str = "joint"
-    """`joint`: ours; `paper2017`: all of the paper's choices together, whatever the stages' own `method` says."""
+    """`joint`: ours; `paper2017`: all of the paper's choices together, whatever the stages' own `method` says.
+
+    How the paper regularises poses (V-B, footnote) it does not say: both have the same prior of them.
+    """
     sign_association: SignAssociationConfig = field(default_factory=SignAssociationConfig)
     """IV-A, signs."""
     lane_association: LaneAssociationConfig = field(default_factory=LaneAssociationConfig)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -17,26 +17,37 @@ from crowdmap_torch.mapper import build_map, certain_part
 from crowdmap_torch.run_folder import read_survey_of, read_truth_of
 from crowdmap_torch.tables import Association, Dataset
 
+
+@dataclass(frozen=True)
+class Compared:
+    """What one method makes of a dataset."""
+
+    heads: MapFigures
+    """The cluster heads, before adjustment."""
+    adjusted: MapFigures
+
+
 COLUMNS = (
-    ("pairs: precision", lambda f: f.association.pair_precision),
-    ("recall", lambda f: f.association.pair_recall),
-    ("data loss", lambda f: f.association.data_loss),
-    ("signs: recall", lambda f: f.signs.recall),
-    ("precision", lambda f: f.signs.precision),
-    ("duplicates", lambda f: f.signs.duplicates),
-    ("close pairs", lambda f: f.signs.close_pairs_told_apart),
-    ("relative [m]", lambda f: f.signs.relative.total.mean),
-    ("absolute [m]", lambda f: f.signs.absolute.total.mean),
-    ("lanes: recall", lambda f: f.lanes.recall),
-    ("precision", lambda f: f.lanes.precision),
-    ("duplicates", lambda f: f.lanes.duplicates),
+    ("pairs: precision", lambda c: c.adjusted.association.pair_precision),
+    ("recall", lambda c: c.adjusted.association.pair_recall),
+    ("data loss", lambda c: c.adjusted.association.data_loss),
+    ("signs: recall", lambda c: c.adjusted.signs.recall),
+    ("precision", lambda c: c.adjusted.signs.precision),
+    ("duplicates", lambda c: c.adjusted.signs.duplicates),
+    ("close pairs", lambda c: c.adjusted.signs.close_pairs_told_apart),
+    ("heads: relative [m]", lambda c: c.heads.signs.relative.total.mean),
+    ("relative [m]", lambda c: c.adjusted.signs.relative.total.mean),
+    ("absolute [m]", lambda c: c.adjusted.signs.absolute.total.mean),
+    ("lanes: recall", lambda c: c.adjusted.lanes.recall),
+    ("precision", lambda c: c.adjusted.lanes.precision),
+    ("duplicates", lambda c: c.adjusted.lanes.duplicates),
 )
 """Heading and value of each column of the table."""
 
 
 def compare(
     dataset_folder: Path, methods: Sequence[str] = METHODS, *, workers: int = 1
-) -> dict[str, MapFigures]:
+) -> dict[str, Compared]:
     """Figures of the map that each method makes of a simulated dataset; ValueError if its truth is missing."""
     dataset = load_dataset(dataset_folder)
     survey = read_survey_of(dataset_folder, dataset.origin)
@@ -47,11 +58,16 @@ def compare(
     for method in methods:
         config = replace(MapperConfig(), method=method)
         result = build_map(dataset, config, workers=workers)
-        figures[method] = evaluate_map(
-            certain_part(result.hd_map, config.min_confidence),
-            survey,
-            truth=truth,
-            associations=sign_associations(dataset, result.associations),
+        figures[method] = Compared(
+            heads=evaluate_map(
+                certain_part(result.map_clusters, config.min_confidence), survey, truth=truth
+            ),
+            adjusted=evaluate_map(
+                certain_part(result.hd_map, config.min_confidence),
+                survey,
+                truth=truth,
+                associations=sign_associations(dataset, result.associations),
+            ),
         )
     return figures
 
