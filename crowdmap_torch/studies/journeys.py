@@ -155,7 +155,12 @@ def _lane_panel(name: str, part: str, ours: dict[int, list[Result]]) -> Panel:
     if counts:
         one = lines[0].y[0] * math.sqrt(counts[0])
         lines.append(
-            Line("statistical bound", counts, [one / math.sqrt(n) for n in counts], style=":")
+            Line(
+                "of one journey / root of n",
+                counts,
+                [one / math.sqrt(n) for n in counts],
+                style=":",
+            )
         )
     return Panel(name, lines)
 

@@ -39,6 +39,9 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
                 continue
             result = folder.read_result(task.key)
             for name in ("journey", "map"):
+                if name == "map" and method == "paper2017":
+                    # To the paper's clustering the signs of one journey are singletons.
+                    continue
                 at = f"{name}.signs"
                 rows.append(
                     (
