@@ -16,6 +16,7 @@ from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.border import BorderedBackend
 from crowdmap_torch.optim.chain import ChainBackend
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
+from crowdmap_torch.optim.matrix_free import MatrixFreeBackend
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable
 from crowdmap_torch.optim.robust import Tukey, median_scale
 from crowdmap_torch.pixel_noise import noise_by_box, shared_error
@@ -68,6 +69,11 @@ class AdjustConfig:
     """Lane points that meet the road further ahead are left out."""
     frame_spacing_m: float = 0.25
     """Frames closer together than this (a car at a light) are thinned."""
+    dense_unknowns: int = 12000
+    """Unknowns of signs and lanes up to which their system is one dense matrix; larger ones are solved by conjugate
+    gradients, matrix-free, and their covariances estimated from samples."""
+    covariance_samples: int = 64
+    """Samples of the map that such covariances are estimated from; their sigmas are then good to 9 %."""
 
 
 class Bundle(nn.Module):
@@ -146,9 +152,16 @@ class Bundle(nn.Module):
             getattr(self, f"base_{name}").copy_(values[name])
             getattr(self, f"delta_{name}").zero_()
 
-    def backend(self) -> BorderedBackend:
+    def backend(self) -> BorderedBackend | MatrixFreeBackend:
         """The solver's back end: frames hang on the drift's chains, both are eliminated, the biases go last."""
         nodes = self.prior.nodes
+        landmarks = ("sign", "size", "lane")
+        if sum(getattr(self, f"delta_{name}").numel() for name in landmarks) > (
+            self.config.dense_unknowns
+        ):
+            return MatrixFreeBackend(
+                "drift", nodes.journey, leaves="pose", carrier=nodes.of_frame, border="bias"
+            )
         chains = ChainBackend("drift", nodes.journey, leaves="pose", carrier=nodes.of_frame)
         return BorderedBackend(chains, "bias")
 

@@ -1,12 +1,13 @@
 """How sure an adjusted map is: covariances of signs, their corners, lanes and journeys' errors, from one factorisation.
 
 The covariance of the landmarks is the inverse of the reduced system that bundle adjustment solves, poses and biases
-marginalised; what all positions share is kept apart.
+marginalised; what all positions share is kept apart. Of a map too large for that inverse, samples are drawn instead.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -14,8 +15,9 @@ from torch import Tensor
 
 from crowdmap_torch.bundle import Bundle
 from crowdmap_torch.geometry import polygon, se3, spline_basis
+from crowdmap_torch.optim.linear import layout
+from crowdmap_torch.optim.matrix_free import MatrixFreeEquations
 from crowdmap_torch.tables import Lanes, Signs
-
 
 _MOST_PLACES = 500
 """Places along the lanes of a map without signs at which it is asked what all have in common."""
@@ -40,18 +42,78 @@ class MapUncertainty:
     bias_covariance: Float[Tensor, "j 4 4"]
 
 
+class _Joint(Protocol):
+    """The joint covariance of all landmarks, packed behind each other."""
+
+    def among(self, at: Int[Tensor, "n q"]) -> Float[Tensor, "n q q"]:
+        """Of the entries in each row of `at`, among themselves."""
+        ...
+
+    def shared(self, at: Int[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
+        """What the rows of `at` have in common."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Dense:
+    matrix: Float[Tensor, "r r"]
+
+    def among(self, at: Int[Tensor, "n q"]) -> Float[Tensor, "n q q"]:
+        return self.matrix[at[:, :, None], at[:, None]]
+
+    def shared(self, at: Int[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
+        rows = at.flatten()
+        factor = torch.linalg.cholesky(self.matrix[rows[:, None], rows])
+        all_alike = torch.eye(3).to(factor).repeat(len(at), 1)
+        return torch.linalg.inv(all_alike.mT @ torch.cholesky_solve(all_alike, factor))
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    drawn: Float[Tensor, "r s"]
+
+    def among(self, at: Int[Tensor, "n q"]) -> Float[Tensor, "n q q"]:
+        drawn = self.drawn[at]
+        return drawn @ drawn.mT / self.drawn.shape[1]
+
+    def shared(self, at: Int[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
+        # Too few samples to tell what is in common to the last: the mean over all pairs is next to it.
+        drawn = self.drawn[at].mean(0)
+        return drawn @ drawn.mT / self.drawn.shape[1]
+
+
 @torch.no_grad()
-def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertainty:
-    """Covariances at the bundle's values; `signs` and `lanes` are those that it was built from."""
+def map_uncertainty(
+    bundle: Bundle, signs: Signs, lanes: Lanes, *, generator: torch.Generator | None = None
+) -> MapUncertainty:
+    """Covariances at the bundle's values; `signs` and `lanes` are those that it was built from.
+
+    The `generator` is for maps of which samples are drawn; None: one with a fixed seed.
+    """
     values = bundle.values()
     nodes = bundle.prior.nodes
     journeys = len(values["bias"])
-    normal = bundle.backend().assemble(bundle.problem(held=False), values)
+    problem = bundle.problem(held=False)
+    normal = bundle.backend().assemble(problem, values)
     to_bias = _to_bias(values["pose"][nodes.first])
     count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)
-    found = normal.covariances(to_bias.mT / count[nodes.journey, None, None])
-    assert found.sums is not None
-    joint, offset = found.landmarks, normal.inner.structure.where.offset
+    weight = to_bias.mT / count[nodes.journey, None, None]
+    where = layout(problem, values, skip=("pose", "drift", "bias"))
+    offset = where.offset
+    joint: _Joint
+    if isinstance(normal, MatrixFreeEquations):
+        generator = generator or torch.Generator().manual_seed(0)
+        drawn = normal.samples(bundle.config.covariance_samples, generator)
+        joint = _Sampled(torch.cat([drawn[name].flatten(0, 1) for name in offset]))
+        sums = drawn["drift"].new_zeros(journeys, 4, drawn["drift"].shape[-1])
+        sums.index_add_(0, nodes.journey, weight.mT @ drawn["drift"])
+        of_bias = sums @ sums.mT / sums.shape[-1]
+    else:
+        found = normal.covariances(weight)
+        assert found.sums is not None
+        joint = _Dense(found.landmarks)
+        own = torch.arange(journeys, device=count.device)
+        of_bias = found.sums.view(journeys, 4, journeys, 4)[own, :, own]
     sign = torch.cat(
         [
             offset[name][:, None]
@@ -60,14 +122,12 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
         ],
         dim=1,
     )
-    of_sign = joint[sign[:, :, None], sign[:, None, :]]
+    of_sign = joint.among(sign)
     lane = offset["lane"][:, None] + torch.arange(3, device=count.device)
     at = sign[:, :3] if len(signs) else lane[:: max(len(lane) // _MOST_PLACES, 1)]
-    shared = _in_common(joint, at) if len(at) else joint.new_zeros(3, 3)
+    shared = joint.shared(at) if len(at) else to_bias.new_zeros(3, 3)
     bias = (to_bias @ values["drift"][..., None])[..., 0]
     bias = nodes.mean(bias, journeys)
-    own = torch.arange(journeys, device=count.device)
-    of_bias = found.sums.view(journeys, 4, journeys, 4)[own, :, own]
     silent = count == 0
     return MapUncertainty(
         center=of_sign[:, :3, :3],
@@ -86,14 +146,6 @@ def _to_bias(T_world_camera: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 6"]:
     # The rotation is about the camera's axes; its part about world up is the heading.
     matrix[:, 3, 3:] = T_world_camera[:, 2, :3]
     return matrix
-
-
-def _in_common(joint: Float[Tensor, "r r"], at: Int[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
-    """The part of the joint covariance that the rows of `at` share."""
-    rows = at.flatten()
-    factor = torch.linalg.cholesky(joint[rows[:, None], rows])
-    all_alike = torch.eye(3).to(factor).repeat(len(at), 1)
-    return torch.linalg.inv(all_alike.mT @ torch.cholesky_solve(all_alike, factor))
 
 
 def _corner_covariance(
@@ -117,18 +169,18 @@ def _corner_covariance(
 def _lane_sigma(
     bundle: Bundle,
     lanes: Lanes,
-    joint: Float[Tensor, "r r"],
-    place: Float[Tensor, "c 3"],
+    joint: _Joint,
+    place: Int[Tensor, "c 3"],
 ) -> Float[Tensor, " c"]:
     """1-sigma of every control point across its lane; a control point is a weighted sum of coefficients."""
     if not len(lanes):
-        return joint.new_zeros(0)
+        return bundle.lane_points.camera_height.new_zeros(0)
     count = lanes.control_count
     spline, rank = spline_basis.rows(count)
     start = spline_basis.starts(count)
-    row, weight, _ = spline_basis.window_flat(rank.to(joint), start[spline], count[spline])
     across = bundle.fixed["lane_prior"].constants[1][:, :, 1]
+    row, weight, _ = spline_basis.window_flat(rank.to(across), start[spline], count[spline])
     at = place[row].flatten(1)
     push = (weight[:, :, None] * across[:, None]).flatten(1)
-    variance = (push[:, None] @ joint[at[:, :, None], at[:, None]] @ push[..., None])[:, 0, 0]
+    variance = (push[:, None] @ joint.among(at) @ push[..., None])[:, 0, 0]
     return variance.clamp_min(0).sqrt()

@@ -452,7 +452,7 @@ def _assemble(
             sums.add_hessian(piece, part)
             index = [block + base[slot] for slot, block in piece.slots if slot in base]
             if len(index) == 2:
-                _add_link(link, structure, index[0], index[1], part.hessian[0, 1].permute(2, 0, 1))
+                add_link(link, structure, index[0], index[1], part.hessian[0, 1].permute(2, 0, 1))
             if coupling is not None:
                 _add_mixed(couplings[name], coupling, at, part)
         term_cost[name] = cost
@@ -468,6 +468,30 @@ def _assemble(
         sums.hessian(),
         sums.gradient(),
         workspace,
+    )
+
+
+def chain_equations(
+    structure: ChainStructure,
+    diagonal: Float[Tensor, "n k k"],
+    link: Float[Tensor, "n k k"],
+    gradient: Float[Tensor, "n k"],
+) -> ChainNormalEquations:
+    """Normal equations of chains and leaves alone, from their blocks; `structure` knows of no landmarks."""
+    nothing = gradient.new_zeros(1)
+    store = gradient.new_empty(structure.store_rows + 1, gradient.shape[1])
+    none = gradient.new_zeros(0)
+    return ChainNormalEquations(
+        nothing,
+        {},
+        structure,
+        diagonal,
+        link,
+        gradient,
+        {},
+        none.view(0, 0),
+        none,
+        _Workspace(store),
     )
 
 
@@ -566,7 +590,7 @@ class _Sums:
         self.matrix.view(-1).index_add_(0, at.flatten(), block.flatten())
 
 
-def _add_link(
+def add_link(
     link: Tensor,
     structure: ChainStructure,
     first: Int[Tensor, " m"],

@@ -1,0 +1,88 @@
+"""Conjugate gradients on the Schur complement against the dense solve."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from bordered_chains import drives, rows_of
+
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.linear import DenseBackend
+from crowdmap_torch.optim.matrix_free import MatrixFreeBackend
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
+
+
+def matrix_free(backend, **changes):
+    """The same elimination as that of a bordered back end."""
+    inner = backend.inner
+    settings = {"tolerance": 1e-12, "chunk_rows": 50, **changes}
+    return MatrixFreeBackend(
+        inner.eliminate, inner.chain, inner.leaves, inner.carrier, backend.border, **settings
+    )
+
+
+@pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
+def test_conjugate_gradients_give_the_dense_step(lengths):
+    problem, values, backend, _ = drives(lengths)
+    ours, dense = (b.assemble(problem, values) for b in (matrix_free(backend), DenseBackend()))
+    torch.testing.assert_close(ours.cost, dense.cost)
+    for damping in (1e-9, 1e-2, 1e2):
+        damping = torch.tensor([damping], dtype=torch.float64)
+        mine, theirs = ours.solve(damping), dense.solve(damping)
+        assert bool(mine.solved)
+        for name in values:
+            torch.testing.assert_close(mine.delta[name], theirs.delta[name], rtol=1e-7, atol=1e-9)
+        torch.testing.assert_close(mine.predicted, theirs.predicted)
+        torch.testing.assert_close(mine.norm, theirs.norm)
+
+
+def test_a_chain_alone_is_solved_too():
+    chain = torch.zeros(9, dtype=torch.long)
+    every = torch.arange(9)
+    terms = {"prior": CostTerm(lambda d: d - 1.5, (("drift", every),))}
+    problem = Problem({"drift": Variable(2, euclidean)}, terms)
+    values = {"drift": torch.linspace(0, 1, 18, dtype=torch.float64).view(9, 2)}
+    step = (
+        MatrixFreeBackend("drift", chain).assemble(problem, values).solve(torch.zeros(1).double())
+    )
+    torch.testing.assert_close(
+        values["drift"] + step.delta["drift"], torch.full((9, 2), 1.5).double()
+    )
+
+
+def test_the_minimum_is_that_of_the_bordered_back_end():
+    problem, values, backend, _ = drives(seed=1)
+    config = lm.LmConfig(cost_tolerance=1e-13)
+    ours = lm.solve(problem, values, config, backend=matrix_free(backend))
+    theirs = lm.solve(problem, values, config, backend=backend)
+    assert ours.done
+    for name, value in theirs.values.items():
+        torch.testing.assert_close(ours.values[name], value, rtol=0, atol=1e-6)
+
+
+def test_samples_have_the_covariance_of_the_dense_inverse():
+    problem, values, backend, _ = drives()
+    inverse = torch.linalg.inv(DenseBackend().assemble(problem, values).hessian[0])
+    dense = DenseBackend().assemble(problem, values)
+    count = 4000
+    drawn = (
+        matrix_free(backend)
+        .assemble(problem, values)
+        .samples(count, torch.Generator().manual_seed(0), floor=0.0)
+    )
+    for name in values:
+        at = rows_of(dense, name)
+        expected = inverse[at][:, at]
+        flat = drawn[name].flatten(0, 1)
+        found = flat @ flat.mT / count
+        # An entry's standard deviation is at most sqrt(2 / count) of the variances' product.
+        bound = 6 * (2 / count) ** 0.5 * expected.diagonal().max()
+        assert (found - expected).abs().max() < bound
+
+
+def test_too_few_iterations_are_no_step():
+    problem, values, backend, _ = drives()
+    ours = matrix_free(backend, max_iterations=2).assemble(problem, values)
+    step = ours.solve(torch.tensor([1e-9], dtype=torch.float64))
+    assert not bool(step.solved)
+    assert not any(delta.any() for delta in step.delta.values())
