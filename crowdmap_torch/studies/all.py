@@ -10,6 +10,8 @@ from crowdmap_torch.studies import (
     bundle_gain,
     control,
     data_loss,
+    efficiency,
+    honesty,
     journeys,
     noise,
     preset,
@@ -30,6 +32,8 @@ STUDIES = (
     ablation.STUDY,
     noise.STUDY,
     bad_drives.STUDY,
+    honesty.STUDY,
+    efficiency.STUDY,
     real.STUDY,
 )
 

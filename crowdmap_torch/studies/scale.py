@@ -44,6 +44,12 @@ class Scale:
     """For each of the presets beside it."""
     short_seeds: int = 3
     """On the short road."""
+    honest_journeys: int = 10
+    """Journeys on the short road whose map's covariances are judged."""
+    honest_sets: int = 20
+    """Data sets of them."""
+    linear_sets: int = 8
+    """Those of them that the linear estimator is given too."""
     draws: int = 3
     """Most maps of one or two journeys of a dataset, other journeys each time."""
     noise_steps: int = 3
@@ -111,6 +117,9 @@ QUICK = Scale(
     preset_seeds=1,
     other_preset_seeds=1,
     short_seeds=1,
+    honest_journeys=3,
+    honest_sets=1,
+    linear_sets=1,
     draws=1,
     noise_steps=1,
     faults=2,

@@ -1,0 +1,276 @@
+"""The best that can be done, by plain dense algebra: least squares linearised at the truth, and its covariance.
+
+The estimator knows what each detection shows, which ones are outliers, and all noise levels; the poses' error is the
+exact Gaussian process of the simulation. Its covariance is the Cramer-Rao bound. Nothing here is shared with the solver
+but the residuals: one dense matrix per journey, so it is for roads of a few hundred metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.bundle import AdjustConfig, Bundle
+from crowdmap_torch.geometry import camera, polygon, se3
+from crowdmap_torch.io.truth import JourneyTruth, Truth
+from crowdmap_torch.observations import CornerObservations
+from crowdmap_torch.optim.linearize import linearize
+from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.simulate.dataset import SimulationConfig
+from crowdmap_torch.simulate.positioning import PositioningConfig
+from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
+from crowdmap_torch.stages import adjust
+from crowdmap_torch.tables import (
+    Association,
+    ControlPoints,
+    Journey,
+    Lanes,
+    RoadEstimate,
+    Signs,
+    Survey,
+)
+
+CONTROL_SPACING_M = 8.0
+"""Distance between the control points of the true lanes."""
+_OUTLIER_SIGMAS = 4.5
+"""A lane point this far from its marker is one of the outliers, which the truth does not name."""
+
+
+@dataclass(frozen=True)
+class LinearMap:
+    """Signs as the linear estimator has them."""
+
+    signs: Signs
+    """With the bound as covariance of the centres."""
+    row: Int[Tensor, " n"]
+    """The survey's sign of each."""
+    shared: Float[Tensor, "3 3"]
+    """Mean covariance between any two centres [m^2]."""
+
+
+@torch.no_grad()
+def linear_map(
+    truth: Truth, survey: Survey, true_signs: Signs, simulation: SimulationConfig
+) -> LinearMap:
+    """The estimate from all detections of a simulated dataset, and the Cramer-Rao bound of it.
+
+    `true_signs` are the rows of `survey`.
+    """
+    shown = torch.cat([_shown(t) for t in truth.journeys])
+    row = torch.unique(shown[shown >= 0])
+    of_survey = torch.full((len(true_signs),), -1)
+    of_survey[row] = torch.arange(len(row))
+    signs = true_signs[row]
+    bundle = _bundle_at_truth(truth, survey, signs, of_survey)
+    information, force = _prior_of_lanes(bundle)
+    for number, journey in enumerate(truth.journeys):
+        own, push = _of_journey(bundle, truth, number, journey, simulation)
+        information += own
+        force += push
+    covariance = torch.cholesky_inverse(torch.linalg.cholesky(information))
+    delta = -(covariance @ force)
+    n = len(signs)
+    pose, size = delta[: 6 * n].view(n, 6), delta[6 * n : 8 * n].view(n, 2)
+    at = 6 * torch.arange(n)[:, None] + torch.arange(3)
+    shared = covariance[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
+    moved = replace(
+        signs,
+        T_world_sign=se3.retract(signs.T_world_sign, pose),
+        size=signs.size * torch.exp(size),
+        covariance=covariance[at[:, :, None], at[:, None]],
+    )
+    return LinearMap(moved, row, shared)
+
+
+def _shown(truth: JourneyTruth) -> Int[Tensor, " d"]:
+    """The survey's sign that each detection in use shows; -1 for false ones and outliers."""
+    row = truth.journey.signs.row
+    return torch.where(truth.sign_outlier[row], -1, truth.sign[row])
+
+
+def _bundle_at_truth(truth: Truth, survey: Survey, signs: Signs, of_survey: Tensor) -> Bundle:
+    """All observations with their true landmarks, started at the truth."""
+    journeys = [t.journey for t in truth.journeys]
+    roads = [
+        RoadEstimate(
+            t.road_normal_camera,
+            t.camera_height,
+            torch.full_like(t.camera_height, math.radians(0.1)),
+        )
+        for t in truth.journeys
+    ]
+    drifts = [se3.local(t.journey.T_world_camera, t.T_world_camera) for t in truth.journeys]
+    config = AdjustConfig(keyframe_spacing_m=0.25, points_per_detection=24)
+    associations = [_association(t, signs, of_survey) for t in truth.journeys]
+    lanes = _true_lanes(survey)
+    bundle = adjust.build(journeys, roads, signs, lanes, associations, drifts, config)
+    bundle.refresh()
+    return bundle
+
+
+def _association(truth: JourneyTruth, signs: Signs, of_survey: Tensor) -> Association:
+    journey = truth.journey
+    shown = _shown(truth)
+    row = torch.where(shown >= 0, of_survey[shown], -1)
+    row = torch.where((row >= 0) & (signs.shape[row] == journey.signs.shape), row, -1)
+    seen = torch.nonzero(row >= 0)[:, 0]
+    of = signs[row[seen]]
+    px = _true_pixels(journey, truth.T_world_camera[journey.signs.frame[seen]], of.corners_world)
+    shift = torch.zeros_like(row)
+    shift[seen], _ = polygon.best_shift(
+        px, journey.signs.corners_px[seen], polygon.corner_count(of.shape)
+    )
+    return Association(row, shift, torch.full_like(journey.lanes.row, -1))
+
+
+def _true_pixels(journey: Journey, T_world_camera: Tensor, corners_world: Tensor) -> Tensor:
+    px, _ = camera.project(
+        journey.rig.camera, se3.transform(se3.inverse(T_world_camera)[:, None], corners_world)
+    )
+    return px
+
+
+def _true_lanes(survey: Survey) -> Lanes:
+    """Splines through points of the surveyed markers, equally spaced."""
+    points = []
+    for number in range(len(survey.lane_id)):
+        line = survey.lane_points.point_world[survey.lane_points.lane == number]
+        way = torch.cat((line.new_zeros(1), (line[1:] - line[:-1]).norm(dim=1).cumsum(0)))
+        count = max(int(way[-1] / CONTROL_SPACING_M), 1) + 1
+        at = torch.linspace(0, float(way[-1]), count, dtype=way.dtype)
+        after = torch.searchsorted(way, at).clamp(1, len(way) - 1)
+        share = (at - way[after - 1]) / (way[after] - way[after - 1])
+        points.append(torch.lerp(line[after - 1], line[after], share[:, None]))
+    count = torch.tensor([len(p) for p in points])
+    unknown = torch.full_like(count, -1)
+    point = torch.cat(points)
+    return Lanes(
+        type=survey.lane_type,
+        control_start=count.cumsum(0) - count,
+        control_count=count,
+        journey=unknown,
+        tracklet=unknown,
+        frame=unknown,
+        n_journeys=unknown,
+        n_observations=unknown,
+        first_seen_ns=unknown,
+        last_seen_ns=unknown,
+        confidence=count.to(point),
+        control=ControlPoints(point, torch.full_like(point[:, 0], math.nan)),
+    )
+
+
+def _prior_of_lanes(bundle: Bundle) -> tuple[Tensor, Tensor]:
+    """Information and force on the landmarks by what holds lanes where nothing observes them."""
+    terms = [term for name, term in bundle.fixed.items() if name.startswith("lane")]
+    return _normal_equations(bundle, terms, poses=0, first_pose=0)
+
+
+def _columns(bundle: Bundle) -> dict[str, int]:
+    """First column of each kind of landmark."""
+    n = len(bundle.values()["sign"])
+    return {"sign": 0, "size": 6 * n, "lane": 8 * n}
+
+
+def _of_journey(
+    bundle: Bundle, truth: Truth, number: int, journey: JourneyTruth, simulation: SimulationConfig
+) -> tuple[Tensor, Tensor]:
+    """Information and force on the landmarks by one journey, its poses marginalised."""
+    first = sum(t.journey.frame_count for t in truth.journeys[:number])
+    mine = (bundle.frame >= first) & (bundle.frame < first + journey.journey.frame_count)
+    pose = torch.nonzero(mine)[:, 0]
+    frame = bundle.frame[pose] - first
+    p = 6 * len(pose)
+    terms = _true_terms(bundle, simulation, pose)
+    whole, force = _normal_equations(bundle, terms, poses=len(pose), first_pose=int(pose[0]))
+    A, B, C = whole[:p, :p], whole[:p, p:], whole[p:, p:]
+    gx, gy = force[:p], force[p:]
+    T = journey.T_world_camera
+    way = (T[1:, :3, 3] - T[:-1, :3, 3]).norm(dim=1).cumsum(0)
+    way = torch.cat((way.new_zeros(1), way))[frame]
+    prior = torch.linalg.inv(_pose_covariance(way, simulation.positioning))
+    error = se3.local(journey.journey.T_world_camera, T)[frame].flatten()
+    right = torch.cat((B, (gx + prior @ error)[:, None]), dim=1)
+    solved = torch.cholesky_solve(right, torch.linalg.cholesky(A + prior))
+    return C - B.mT @ solved[:, :-1], gy - B.mT @ solved[:, -1]
+
+
+def _true_terms(
+    bundle: Bundle, simulation: SimulationConfig, pose: Int[Tensor, " f"]
+) -> Sequence[CostTerm]:
+    """The journey's observations with their true sigmas, outliers left out."""
+    terms = bundle.problem(held=False).terms
+    low, high = int(pose[0]), int(pose[-1])
+
+    def of_journey(term: CostTerm, weight: Tensor, kept: Tensor) -> CostTerm:
+        at = term.slots[0][1]
+        rows = torch.nonzero(kept & (at >= low) & (at <= high))[:, 0]
+        return replace(
+            term,
+            slots=tuple((name, index[rows]) for name, index in term.slots),
+            constants=tuple(constant[rows] for constant in term.constants),
+            weight=weight[rows],
+        )
+
+    corner, lane = terms["sign_reprojection"], terms["lane_reprojection"]
+    sigma = _true_sigma(bundle, bundle.corners, simulation.signs)
+    every = torch.ones_like(sigma, dtype=torch.bool)
+    valid = bundle.matches.valid
+    kinds, values = dict(bundle.variables), bundle.values()
+    exact = torch.full_like(bundle.matches.t, 1 / simulation.lanes.lane_noise_px)
+    error = linearize(replace(lane, weight=exact), kinds, values).residual[:, 0].abs()
+    return (
+        of_journey(corner, 1 / sigma, every),
+        of_journey(lane, exact, valid & (error < _OUTLIER_SIGMAS)),
+    )
+
+
+def _true_sigma(
+    bundle: Bundle, rows: CornerObservations, config: SignDetectionConfig
+) -> Float[Tensor, " m"]:
+    """The noise that the simulation gave each corner [px]: by the size of the box, which noise hardly changes."""
+    return config.pixel_noise_px * (1 + (config.small_box_px / rows.box_px).square()).sqrt()
+
+
+def _normal_equations(
+    bundle: Bundle, terms: Sequence[CostTerm], *, poses: int, first_pose: int
+) -> tuple[Float[Tensor, "c c"], Float[Tensor, " c"]]:
+    """Hessian and gradient of some terms at the bundle's values: `poses` from the first one on, then the landmarks."""
+    values, kinds, columns = bundle.values(), dict(bundle.variables), _columns(bundle)
+    total = 6 * poses + columns["lane"] + values["lane"].numel()
+    hessian, gradient = torch.zeros(total, total, dtype=torch.float64), torch.zeros(total).double()
+    for term in terms:
+        linear = linearize(term, kinds, values)
+        at = []
+        for (name, index), block in zip(term.slots, linear.jacobians, strict=True):
+            k = block.shape[-1]
+            start = (index - first_pose) * k
+            if name != "pose":
+                start = 6 * poses + columns[name] + index * k
+            at.append(start[:, None] + torch.arange(k))
+        column, J = torch.cat(at, dim=1), torch.cat(linear.jacobians, dim=-1)
+        gradient.index_add_(0, column.flatten(), (J.mT @ linear.residual[..., None]).flatten())
+        place = column[:, :, None] * total + column[:, None]
+        hessian.view(-1).index_add_(0, place.flatten(), (J.mT @ J).flatten())
+    return hessian, gradient
+
+
+def _pose_covariance(way: Float[Tensor, " f"], config: PositioningConfig) -> Float[Tensor, "p p"]:
+    """Covariance of the errors of poses as the simulation draws them, pose by pose."""
+    apart = (way[:, None] - way).abs()
+    eye = torch.eye(len(way), dtype=way.dtype)
+    drift = config.drift_m**2 * torch.exp(-apart / config.drift_length_m)
+    turn = math.radians(config.drift_rot_deg) ** 2 * torch.exp(-apart / config.drift_rot_length_m)
+    turn = turn + math.radians(config.white_rot_deg) ** 2 * eye
+    bias = (config.bias_e_m, config.bias_n_m, config.bias_u_m)
+    white = (config.white_e_m, config.white_n_m, config.white_u_m)
+    axes = [b**2 + drift + w**2 * eye for b, w in zip(bias, white, strict=True)] + [turn] * 3
+    joint = way.new_zeros(len(way), 6, len(way), 6)
+    for k, axis in enumerate(axes):
+        joint[:, k, :, k] = axis
+    return joint.reshape(6 * len(way), 6 * len(way))

@@ -1,0 +1,71 @@
+"""The linear estimator that knows everything is better than the map, and errs as its bound says."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from crowdmap_torch.evaluation.signs import evaluate_signs
+from crowdmap_torch.evaluation.visibility import observable_signs
+from crowdmap_torch.io.maps import read_map
+from crowdmap_torch.io.truth import Truth
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.simulate import SimulationConfig
+from crowdmap_torch.simulate.positioning import PositioningConfig
+from crowdmap_torch.studies import linear_map as module
+from crowdmap_torch.studies.linear_map import LinearMap, linear_map
+from crowdmap_torch.tables import Signs, Survey
+
+
+@pytest.fixture(scope="module")
+def true_signs(tiny_folder: Path) -> Signs:
+    return read_map(tiny_folder / "survey").signs
+
+
+@pytest.fixture(scope="module")
+def found(tiny_truth: Truth, tiny_survey: Survey, true_signs: Signs) -> LinearMap:
+    return linear_map(tiny_truth, tiny_survey, true_signs, SimulationConfig())
+
+
+def test_errors_are_as_large_as_the_bound_says(found: LinearMap, true_signs: Signs):
+    error = found.signs.center_world - true_signs.center_world[found.row]
+    shared = error.mean(0)
+    nees = shared @ torch.linalg.solve(found.shared, shared)
+    # Chi-squared with three degrees of freedom is below 16.3 in 99.9 %.
+    assert nees < 16.3
+    # Three journeys with biases of 0.3, 0.3, 0.42 m, and drifts of 0.25 m that do not quite average out on 120 m.
+    expected = torch.tensor([0.39, 0.39, 0.49], dtype=torch.float64) / math.sqrt(3)
+    assert torch.allclose(found.shared.diagonal().sqrt(), expected, rtol=0.15)
+    own = error - shared
+    sigma = (found.signs.covariance - found.shared).diagonal(dim1=1, dim2=2).mean().sqrt()
+    assert 0.3 < own.square().mean().sqrt() / sigma < 2.0
+
+
+def test_the_map_is_not_better_than_the_bound(
+    found: LinearMap, tiny_truth: Truth, tiny_survey: Survey, tiny_result: MapResult
+):
+    observable = observable_signs(tiny_truth, tiny_survey.signs)
+    best = evaluate_signs(found.signs[observable[found.row]], tiny_survey.signs)
+    ours = evaluate_signs(tiny_result.hd_map.signs, tiny_survey.signs, observable=observable)
+    assert best.absolute.total.mean < 1.05 * ours.absolute.total.mean
+    assert best.relative.total.mean < 1.2 * ours.relative.total.mean
+    # What our map says of what all share is what the bound says.
+    theirs, mine = (s.trace().sqrt() for s in (found.shared, tiny_result.hd_map.shared_covariance))
+    assert float(mine / theirs) == pytest.approx(1.0, abs=0.25)
+
+
+def test_poses_err_by_bias_drift_and_noise():
+    way = torch.tensor([0.0, 150.0], dtype=torch.float64)
+    config = PositioningConfig()
+    covariance = module._pose_covariance(way, config)
+    total = config.bias_e_m**2 + config.drift_m**2 + config.white_e_m**2
+    assert float(covariance[0, 0]) == pytest.approx(total)
+    between = config.bias_e_m**2 + config.drift_m**2 / math.e
+    assert float(covariance[0, 6]) == pytest.approx(between)
+    assert not covariance[0, [1, 2, 3, 4, 5, 7, 8, 9, 10, 11]].any()
+    assert float(covariance[3, 3]) == pytest.approx(
+        math.radians(config.drift_rot_deg) ** 2 + math.radians(config.white_rot_deg) ** 2
+    )
