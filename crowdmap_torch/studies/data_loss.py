@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from crowdmap_torch.studies import paper
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, Point, plot_lines
-from crowdmap_torch.studies.fleet import in_turns, our_maps, paper_heads
+from crowdmap_torch.studies.fleet import curve, in_turns, our_maps, paper_heads
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import Result, Spread, number, numbers, results, spread
+from crowdmap_torch.studies.numbers import Result, Spread, number, numbers, spread
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import Task
 
@@ -30,9 +30,10 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """The paper's measure and METRICS.md's, for both methods."""
     scale = settings.scale
     counts = [n for n in scale.counts if n >= _LEAST]
-    ours = [results(our_maps(scale, n), folder) for n in counts]
     within = [n for n in counts if n <= scale.journeys]
-    theirs = [results(paper_heads(scale, n, seeds=scale.curve_seeds), folder) for n in within]
+    ours = curve(scale, {n: our_maps(scale, n) for n in counts}, folder).values()
+    heads = {n: paper_heads(scale, n, seeds=scale.curve_seeds) for n in within}
+    theirs = curve(scale, heads, folder).values()
     left_out = {
         "ours": (counts, [_left_out(maps) for maps in ours]),
         "paper2017": (within, [_left_out(maps) for maps in theirs]),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.numbers import Result, results
 from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.tasks import MeasureMap
 
@@ -38,6 +40,28 @@ def paper_heads(scale: Scale, count: int, *, seeds: int | None = None) -> list[M
         MeasureMap(scale.drives(seed, lanes=False), count, config=PAPER, adjusted=False)
         for seed in range(seeds)
     ]
+
+
+def curve(
+    scale: Scale, maps: Mapping[int, Sequence[MeasureMap]], folder: StudyFolder
+) -> dict[int, list[Result]]:
+    """Results by the number of journeys, like compared with like.
+
+    Up to the number that counts, those of the seeds alone that are done at every number.
+    """
+    seeds_done = [
+        {task.simulation.seed for task in tasks}
+        - {task.simulation.seed for task in tasks if not task.is_done(folder)}
+        for count, tasks in maps.items()
+        if count <= scale.journeys
+    ]
+    seeds = set.intersection(*seeds_done)
+    return {
+        count: results(
+            [t for t in tasks if count > scale.journeys or t.simulation.seed in seeds], folder
+        )
+        for count, tasks in maps.items()
+    }
 
 
 def in_turns(scale: Scale, maps: Iterable[MeasureMap]) -> Iterator[tuple[int, MeasureMap]]:

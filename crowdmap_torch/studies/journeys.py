@@ -10,7 +10,7 @@ from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.studies import paper
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, Point, plot_lines
-from crowdmap_torch.studies.fleet import in_turns, our_maps, paper_heads
+from crowdmap_torch.studies.fleet import curve, in_turns, our_maps, paper_heads
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.numbers import (
     Result,
@@ -51,12 +51,13 @@ def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """The curves, and the figures at the paper's number of journeys."""
     scale = settings.scale
-    ours = {count: results(our_maps(scale, count), folder) for count in scale.counts}
-    theirs = {
-        count: results(paper_heads(scale, count, seeds=scale.curve_seeds), folder)
+    ours = curve(scale, {count: our_maps(scale, count) for count in scale.counts}, folder)
+    heads = {
+        count: paper_heads(scale, count, seeds=scale.curve_seeds)
         for count in scale.counts
         if 1 < count <= scale.journeys
     }
+    theirs = curve(scale, heads, folder)
     alone = results(_single_journeys(scale), folder)
     return Chapter(
         "journeys",

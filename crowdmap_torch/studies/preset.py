@@ -10,7 +10,7 @@ from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.studies import paper
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, Point, plot_lines
-from crowdmap_torch.studies.fleet import paper_heads
+from crowdmap_torch.studies.fleet import curve, paper_heads
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.numbers import numbers, results, spread
 from crowdmap_torch.studies.scale import Scale
@@ -50,20 +50,22 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """Errors over the number of journeys, and where the presets land."""
     scale, counts = settings.scale, _counts(settings.scale)
     found = {
-        name: [results(_maps(scale, name, count), folder) for count in counts]
+        name: curve(scale, {count: _maps(scale, name, count) for count in counts}, folder)
         for name in POSITIONING
     }
+    judged = results(_maps(scale, "paper", scale.journeys), folder)
     rows, panels = [], []
     for error, (low, high) in _ERRORS.items():
         path = f"heads.signs.{error}.total.mean"
+        all_seeds = astuple(spread(numbers(judged, path)))
+        asked = f"{low:.2f} to {high:.2f}"
+        rows.append(("paper, all seeds", error, scale.journeys, *all_seeds, asked))
         lines = []
         for name, by_count in found.items():
-            means = [spread(numbers(maps, path)) for maps in by_count]
-            lines.append(Line(name, counts, [m.mean for m in means], [m.std for m in means]))
-            for count, row in zip(counts, means, strict=True):
-                asked = f"{low:.2f} to {high:.2f}"
-                is_judged = name == "paper" and count == scale.journeys
-                rows.append((name, error, count, *astuple(row), asked if is_judged else ""))
+            means = {count: spread(numbers(maps, path)) for count, maps in by_count.items()}
+            values = means.values()
+            lines.append(Line(name, counts, [m.mean for m in values], [m.std for m in values]))
+            rows += [(name, error, count, *astuple(row), "") for count, row in means.items()]
         said = paper.ABSOLUTE_M if error == "absolute" else paper.RELATIVE_M
         point = Point("the paper's drives", paper.JOURNEYS, said)
         panels.append(Panel(f"{error} error, cluster heads of paper2017", lines, [point]))
