@@ -171,7 +171,9 @@ class PosePrior:
         likely = drift.new_ones(3)
         slides, rolls = self.drift_sigma.square().split(3, dim=1)
         for _ in range(_SWEEPS):
-            moves, of_moves = self._pooled(likely[1], changes[:, :3], pairs, moves[:, None] * slides)
+            moves, of_moves = self._pooled(
+                likely[1], changes[:, :3], pairs, moves[:, None] * slides
+            )
             turns, of_turns = self._pooled(likely[2], changes[:, 3:], pairs, turns[:, None] * rolls)
             spread = (
                 bias[:, None] * self.bias_sigma[:, :3].square() + moves[:, None] * slow * slides
