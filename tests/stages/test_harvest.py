@@ -193,7 +193,7 @@ def test_a_journey_without_detections_is_left_alone(drive: SignDrive):
 
 def test_a_map_of_nothing_takes_nothing(drive: SignDrive):
     known = torch.zeros(len(drive.sign), dtype=torch.bool)
-    found = harvested(drive, known, drive.sign, signs=map_of(drive)[:0])
+    found = harvested(drive, known, drive.sign, signs=map_of(drive)[torch.nonzero(known)[:, 0]])
     assert bool((found.sign == -1).all())
 
 
