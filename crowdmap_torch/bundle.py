@@ -24,7 +24,7 @@ from crowdmap_torch.pose_prior import PosePrior, PosePriorConfig
 
 _NARROWS = 0.97
 """A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
-_SCALE_RESTS = 0.05
+_SCALE_RESTS = 0.02
 """A scale of the prior that would change by less than this share is at rest."""
 
 
