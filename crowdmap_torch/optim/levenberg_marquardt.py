@@ -76,7 +76,7 @@ class _Place:
 
 _Course = tuple[_Place, ...]
 """The last places, oldest first."""
-_MEMORY = 5
+_MEMORY = 3
 """Most places that are remembered."""
 
 
