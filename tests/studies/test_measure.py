@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from nested import flat
 
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.evaluate import evaluate_map
@@ -36,7 +37,8 @@ def test_the_measured_map_is_that_of_the_mapper(
         kept = certain_part(hd_map, config.min_confidence)
         expected = evaluate_map(kept, tiny_survey, truth=tiny_truth).as_dict()
         for part in ("signs", "lanes", "oracle"):
-            assert measured[name][part] == expected[part], (name, part)
+            # Sums in another order differ in the last bits.
+            assert flat(measured[name][part]) == pytest.approx(flat(expected[part]), rel=1e-6)
     assert measured["map"]["association"]["data_loss"] is not None
     assert measured["suspects"] == [] and measured["bad"] == {}
     assert measured["clusters"]["signs"] == sum(len(m.signs) for m in tiny_result.journey_maps)
