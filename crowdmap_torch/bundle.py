@@ -44,6 +44,8 @@ class AdjustConfig:
     """Residuals beyond this many standard deviations have no weight."""
     sign_sigma_px: float = 0.5
     """Least standard deviation of a sign corner of a large box; more where the residuals say so."""
+    box_sigma: float = 0.5
+    """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, as a share of them."""
     lane_sigma_px: float = 0.8
     """Least standard deviation of a lane point across the marker."""
     lane_correlation: float = 1.0
@@ -206,7 +208,8 @@ class Bundle(nn.Module):
         for term in self._corner_term(1.0).values():
             # Of a two-dimensional normal residual the median length is 1.1774 sigma.
             length = whitened_residuals(term, values).norm(dim=-1) / 1.1774
-            noise = noise_by_box(length, self.corners.box_px)
+            tight = self.corners.loose_px == 0
+            noise = noise_by_box(length[tight], self.corners.box_px[tight])
             seen[0] = noise.large_px.clamp_min(config.sign_sigma_px)
             small_box = noise.small_box_px
         if len(self.lane_points):
@@ -249,7 +252,9 @@ class Bundle(nn.Module):
 
     def corner_sigma(self) -> Float[Tensor, " m"]:
         """Standard deviation of every sign corner in u and in v [px]."""
-        return self.scale[0] * (1 + (self.small_box / self.corners.box_px).square()).sqrt()
+        box, loose = self.corners.box_px, self.corners.loose_px
+        variance = self.scale[0].square() * (1 + (self.small_box / box).square())
+        return (variance + loose.square()).sqrt()
 
     def _corner_term(self, sigma: float | Float[Tensor, " m"]) -> dict[str, CostTerm]:
         rows = self.corners

@@ -30,6 +30,8 @@ class CornerObservations(Rows):
     """Observation matrix (geometry.camera)."""
     box_px: Float[Tensor, " m"]
     """Larger side of the detection's box in the image."""
+    loose_px: Float[Tensor, " m"]
+    """What the detection's kind adds to the noise of a corner: the sides of a box are not those of the sign."""
 
 
 @dataclass(frozen=True)
@@ -82,20 +84,28 @@ class ControlPoints(Rows):
 
 
 def corner_observations(
-    journeys: Sequence[Journey], associations: Sequence[Association], signs: Signs
+    journeys: Sequence[Journey],
+    associations: Sequence[Association],
+    signs: Signs,
+    *,
+    box_sigma: float,
 ) -> CornerObservations:
-    """Corners of the detections that show a sign of the map, where the shapes agree."""
+    """Corners of the detections that show a sign of the map, where the shapes agree.
+
+    Detections that are axis-aligned boxes were drawn around a sign, with sides wrong by the share `box_sigma`: their
+    centres are rows of their own, and their corners know no more than that.
+    """
     offsets = frame_offsets(journeys)
     return concatenate(
         [
-            _corners(journey, association, signs, offset)
+            _corners(journey, association, signs, offset, box_sigma)
             for journey, association, offset in zip(journeys, associations, offsets, strict=False)
         ]
     )
 
 
 def _corners(
-    journey: Journey, association: Association, signs: Signs, offset: int
+    journey: Journey, association: Association, signs: Signs, offset: int, box_sigma: float
 ) -> CornerObservations:
     detections = journey.signs
     used = torch.nonzero(association.sign >= 0)[:, 0]
@@ -110,13 +120,28 @@ def _corners(
     )
     # Slots past the shape's number of corners repeat one of them.
     box = (px.amax(1) - px.amin(1)).amax(-1)
-    row, corner = torch.nonzero(polygon.corner_mask(shape), as_tuple=True)
+    mask, template = polygon.corner_mask(shape), polygon.template(shape)
+    row, corner = torch.nonzero(mask, as_tuple=True)
+    boxed = polygon.is_box(px)
+    centre = torch.nonzero(boxed)[:, 0]
+
+    def mean(at_corners: Float[Tensor, "d 8 2"]) -> Float[Tensor, "c 2"]:
+        among = mask[centre, :, None].to(at_corners)
+        return (at_corners[centre] * among).sum(1) / among.sum(1)
+
+    of = torch.cat((row, centre))
+    px, ideal, template = (
+        torch.cat((part[row, corner], mean(part))) for part in (px, ideal, template)
+    )
+    loose = torch.zeros_like(box[of])
+    loose[: len(row)] = box_sigma / 2 * box[row] * boxed[row]
     return CornerObservations(
-        frame=detections.frame[used][row] + offset,
-        sign=sign[row],
-        template=polygon.template(shape)[row, corner],
-        matrix=camera.observation_matrix(journey.rig.camera, px[row, corner], ideal[row, corner]),
-        box_px=box[row],
+        frame=detections.frame[used][of] + offset,
+        sign=sign[of],
+        template=template,
+        matrix=camera.observation_matrix(journey.rig.camera, px, ideal),
+        box_px=box[of],
+        loose_px=loose,
     )
 
 

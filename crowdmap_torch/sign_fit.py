@@ -444,8 +444,7 @@ def _noise(
 def _box_scales(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, "m 16 2"]:
     """Derivatives of the corners by the logarithms of the box's width and height; zero for outlines that are no boxes."""
     low, high = corners_px.amin(1, keepdim=True), corners_px.amax(1, keepdim=True)
-    is_box = ((corners_px == low) | (corners_px == high)).all(-1).all(-1)
-    offset = (corners_px - (low + high) / 2) * is_box[:, None, None]
+    offset = (corners_px - (low + high) / 2) * polygon.is_box(corners_px)[:, None, None]
     return torch.diag_embed(offset).flatten(1, 2)
 
 

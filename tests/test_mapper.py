@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import se3, spline
+from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.mapper import MapResult, build_map, certain_part, map_journeys
 from crowdmap_torch.tables import Dataset, HdMap, Journey
 
@@ -189,3 +192,15 @@ def test_journeys_without_detections_give_a_map_of_nothing(tiny: Dataset, method
     assert len(result.hd_map.signs) == len(result.hd_map.lanes) == 0
     for journey, poses in zip(journeys, result.poses, strict=True):
         assert torch.allclose(poses, journey.T_world_camera)
+
+
+def test_adjusting_one_real_drive_of_boxes_keeps_its_signs_in_place(real_data):
+    folder = real_data("kitti-signs/kitti-05")
+    result = build_map(load_dataset(folder), CONFIG)
+    wanted = json.loads((folder.parent / "eligible.json").read_text())["kitti-05"]
+    survey = read_survey(folder / "survey")
+    rows = [survey.sign_id.index(sign) for sign in wanted]
+    distance = torch.cdist(survey.signs.center_world[rows], result.hd_map.signs.center_world)
+    nearest = distance.min(1).values
+    # As corners of the signs the boxes pushed them 0.76 m away in the mean; by the heads alone it is 0.2 m.
+    assert nearest.mean() < 0.4

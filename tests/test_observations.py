@@ -12,6 +12,7 @@ from torch.func import vmap
 from crowdmap_torch import residuals
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.geometry.polygon import SHAPES
 from crowdmap_torch.observations import (
     corner_observations,
     frame_offsets,
@@ -145,7 +146,9 @@ def seen(signs: Signs, rig: Rig, x: Tensor, shift: Tensor) -> tuple[Journey, Ass
 
 def corner_residuals(signs: Signs, journeys, associations) -> tuple[Tensor, Tensor]:
     """Pixel errors of all corner rows, and the sign of each."""
-    rows = corner_observations(journeys, associations, signs)
+    rows = corner_observations(journeys, associations, signs, box_sigma=0.5)
+    # A sign seen from straight ahead is a box to the last digit, and its centre a row of its own.
+    rows = rows[rows.template.norm(dim=-1) > 0]
     T = torch.cat([j.T_world_camera for j in journeys])[rows.frame]
     of_sign = signs[rows.sign]
     error = vmap(residuals.sign_reprojection)(
@@ -183,20 +186,48 @@ def test_detections_of_another_shape_or_of_no_sign_are_left_out(signs: Signs):
     sign = association.sign.clone()
     sign[4] = -1
     journey = replace(journey, signs=replace(journey.signs, shape=shape))
-    rows = corner_observations([journey], [replace(association, sign=sign)], signs)
+    rows = corner_observations([journey], [replace(association, sign=sign)], signs, box_sigma=0.5)
     assert rows.sign.unique().tolist() == [0, 1, 3, 5]
 
 
 def test_frames_are_counted_over_all_journeys(signs: Signs):
     one = seen(signs, make_rig(), metres(2, 1.0), torch.zeros(6).long())
-    rows = corner_observations([one[0], one[0]], [one[1], one[1]], signs)
+    rows = corner_observations([one[0], one[0]], [one[1], one[1]], signs, box_sigma=0.5)
     assert rows.frame.unique().tolist() == [0, 1, 2, 3]
 
 
 def test_journeys_without_signs_give_no_rows(signs: Signs):
     journey = make_journey(make_rig(), driving_east(metres(3, 1.0)))
     none = torch.zeros(0, dtype=torch.int64)
-    assert len(corner_observations([journey], [Association(none, none, none)], signs)) == 0
+    assert (
+        len(corner_observations([journey], [Association(none, none, none)], signs, box_sigma=0.5))
+        == 0
+    )
+
+
+def test_of_boxes_the_centre_counts_and_the_corners_hardly(signs: Signs):
+    journey, association = seen(signs, make_rig(), metres(1, 1.0), torch.zeros(6).long())
+    rectangle = SHAPES.index("rectangle")
+    k = signs.shape.tolist().index(rectangle)
+    px = journey.signs.corners_px.clone()
+    low, high = px[k].amin(0), px[k].amax(0)
+    corner = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]] + [[0, 1]] * 4, dtype=torch.float64)
+    px[k] = low + corner * (high - low)
+    ideal = (px - torch.tensor([639.5, 399.5])) / 900
+    boxed = replace(journey.signs, corners_px=px, corners_ideal=ideal)
+    rows = corner_observations([replace(journey, signs=boxed)], [association], signs, box_sigma=0.5)
+    mine = rows[rows.sign == k]
+    assert len(mine) == 5
+    torch.testing.assert_close(mine.loose_px[:4], (high - low).max() / 4 * torch.ones(4).double())
+    assert mine.loose_px[4] == 0
+    torch.testing.assert_close(mine.template[4], torch.zeros(2).double(), rtol=0, atol=1e-12)
+    # On the axis through the box's centre the error is zero.
+    centre = (low + high) / 2
+    ray = torch.cat(((centre - torch.tensor([639.5, 399.5])) / 900, torch.ones(1).double()))
+    error = residuals.pixel_error(7 * ray, mine.matrix[4])
+    torch.testing.assert_close(error, torch.zeros(2).double(), rtol=0, atol=1e-9)
+    others = rows[rows.sign != k]
+    assert (others.loose_px == 0).all()
 
 
 # Lane points.

@@ -73,6 +73,12 @@ def corner_count(shape: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch"]:
     return CORNER_COUNT.to(shape.device)[shape]
 
 
+def is_box(corners_px: Float[Tensor, "m 8 2"]) -> Bool[Tensor, " m"]:
+    """Whether an outline is an axis-aligned box of the image, to the last digit."""
+    low, high = corners_px.amin(1, keepdim=True), corners_px.amax(1, keepdim=True)
+    return ((corners_px == low) | (corners_px == high)).all(-1).all(-1)
+
+
 def corner_mask(shape: Int[Tensor, "*batch"]) -> Bool[Tensor, "*batch 8"]:
     """True for the slots that hold a corner of the shape."""
     slot = torch.arange(MAX_CORNERS, device=shape.device)

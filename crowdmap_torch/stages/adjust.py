@@ -56,7 +56,7 @@ def build(
     prior = torch.cat([journey.T_world_camera for journey in journeys])
     drift = torch.cat(list(drifts))
     start = se3.retract(prior, drift)
-    corners = corner_observations(journeys, associations, signs)
+    corners = corner_observations(journeys, associations, signs, box_sigma=config.box_sigma)
     points, matches = _lane_rows(journeys, roads, lanes, start, config)
     trusted = torch.ones(len(prior), dtype=torch.bool, device=prior.device)
     for number in left_out:

@@ -344,3 +344,11 @@ def test_no_signs_are_no_fault():
     assert (T.shape, size.shape, shift.shape) == ((0, 4, 4), (0, 2), (0,))
     assert polygon.canonical(T, size, none)[0].shape == (0, 4, 4)
     assert polygon.best_shift(corners, corners, none)[0].shape == (0,)
+
+
+def test_a_box_is_axis_aligned_to_the_last_digit():
+    corner = torch.tensor([[3, 5], [9, 5], [9, 7], [3, 7]] + [[3, 7]] * 4, dtype=torch.float64)
+    tilted = corner.clone()
+    tilted[1, 1] += 1e-9
+    diamond = torch.tensor([[6, 5], [9, 6], [6, 7], [3, 6]] + [[3, 6]] * 4, dtype=torch.float64)
+    assert polygon.is_box(torch.stack((corner, tilted, diamond))).tolist() == [True, False, False]
