@@ -131,10 +131,6 @@ class BorderedNormalEquations:
         delta.update(self.inner.unstack(chain))
         return self._finished(delta, own, damping[0])
 
-    def marginal_covariance(self, *, floor: float = 1e-9) -> Float[Tensor, "r r"]:
-        """Covariance of the landmarks jointly, chains and border marginalised."""
-        return self.covariances(floor=floor).landmarks
-
     def covariances(
         self,
         weight: Float[Tensor, "n k m"] | None = None,

@@ -69,7 +69,7 @@ class ChainBackend:
 
     def prepare(self, problem: Problem, values: Values) -> None:
         """Works the structure out and takes the workspace, unless both are there for such a problem."""
-        if self._structure is None or not _same_rows(problem, self._problem):
+        if self._structure is None or not same_rows(problem, self._problem):
             if problem.group_count != 1:
                 raise ValueError("chains are eliminated in one problem at a time, not in a batch")
             self._structure = analyse(
@@ -88,7 +88,7 @@ class ChainBackend:
             self._workspace = _Workspace(block.new_empty(self._structure.store_rows + 1, k))
 
 
-def _same_rows(problem: Problem, other: Problem | None) -> bool:
+def same_rows(problem: Problem, other: Problem | None) -> bool:
     """Whether the terms of two problems touch the same blocks, by identity of their index tensors."""
     if other is None or list(problem.terms) != list(other.terms):
         return False

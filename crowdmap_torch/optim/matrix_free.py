@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.chain import ChainNormalEquations, add_link, chain_equations
+from crowdmap_torch.optim.chain import ChainNormalEquations, add_link, chain_equations, same_rows
 from crowdmap_torch.optim.chain_structure import ChainStructure, analyse
 from crowdmap_torch.optim.linear import DIAGONAL_FLOOR, Step
 from crowdmap_torch.optim.linearize import CHUNK_ROWS, chunks, linearize
@@ -43,7 +43,8 @@ class MatrixFreeBackend:
     """The same for samples, whose scatter is larger by far than what this leaves."""
     max_iterations: int = 2000
     chunk_rows: int = CHUNK_ROWS
-    _slots: object = field(default=None, repr=False)
+    _problem: Problem | None = field(default=None, repr=False)
+    """What the structure was worked out for."""
     _structure: ChainStructure | None = field(default=None, repr=False)
 
     def assemble(self, problem: Problem, values: Values) -> MatrixFreeEquations:
@@ -99,15 +100,10 @@ class MatrixFreeBackend:
             slots = tuple(slot for slot in term.slots if slot[0] in base)
             if slots:
                 terms[name] = replace(term, slots=slots)
-        seen = [block for term in terms.values() for _, block in term.slots]
-        known = self._slots
-        if (
-            not isinstance(known, list)
-            or len(known) != len(seen)
-            or any(a is not b for a, b in zip(known, seen, strict=True))
-        ):
+        chains = Problem({name: problem.variables[name] for name in base}, terms)
+        if self._structure is None or not same_rows(chains, self._problem):
             self._structure = analyse(
-                Problem({name: problem.variables[name] for name in base}, terms),
+                chains,
                 values,
                 self.eliminate,
                 self.chain,
@@ -116,8 +112,7 @@ class MatrixFreeBackend:
                 group_size=None,
                 batch_bytes=1 << 22,
             )
-            self._slots = seen
-        assert self._structure is not None
+            self._problem = chains
         return self._structure
 
 

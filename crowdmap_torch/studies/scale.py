@@ -80,12 +80,6 @@ class Scale:
             seed=seed,
         )
 
-    def curve_counts(self, seed: int) -> tuple[int, ...]:
-        """Of how many journeys maps are made in a world."""
-        if seed < self.most_seeds:
-            return self.counts
-        return tuple(n for n in self.counts if n <= self.journeys)
-
 
 def without_lanes(simulation: SimulationConfig) -> SimulationConfig:
     """The same drives, their lane detector switched off."""
