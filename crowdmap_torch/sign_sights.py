@@ -25,7 +25,7 @@ class SignAssociationConfig:
 
     method: str = "predicted"
     """`predicted`: the epipolar cost to the last measurement, and the distance to where the tracklet is predicted to appear
-    and how large; `epipolar`: the epipolar cost alone, as in the paper."""
+    and how large; `epipolar`: the epipolar cost alone, as in the paper, of detections of its shape near the prediction."""
     window_frames: int = 25
     """Association window w: tracklets silent for longer are ignored [frames]."""
     corner_matching: str = "cyclic"
@@ -33,7 +33,7 @@ class SignAssociationConfig:
     max_epipolar_px: float = 6.0
     """A detection starts a new tracklet where the root mean epipolar cost over vertices exceeds this [px]."""
     max_distance: float = 5.0
-    """... or where it is this many standard deviations from every prediction; method `predicted`."""
+    """... or where it is this many standard deviations from every prediction: implausible motion."""
     unmatched_cost: float = 24.0
     """What leaving a detection and a tracklet unmatched costs, as minus twice a log-likelihood; method `predicted`."""
     sure_after: int = 3

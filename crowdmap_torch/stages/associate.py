@@ -194,17 +194,18 @@ class SignAssociator:
     ) -> tuple[Float[np.ndarray, "n m"], float]:
         """Cost of continuing each tracklet with each detection, and the cost of leaving both alone."""
         c = self.config
-        if c.method == "epipolar":
-            return epipolar_px2, c.max_epipolar_px**2
         innovation = depth_filter.innovation(
             prediction, sights.sighting[rows], sights.variance[rows]
         )
-        # The poses' own noise moves the epipolar lines of near signs.
         depth = prediction.depth[:, None]
-        pose_px2 = (sights.focal[rows] / np.maximum(depth, c.min_depth_m)) ** 2
-        epipolar = epipolar_px2 / (c.sigma_px**2 + pose_px2 * self._pose_variance)
+        other_shape = old.votes.argmax(-1)[:, None] != sights.shape[rows]
         refused = innovation.distance_sq > c.max_distance**2
         refused |= (depth < c.min_depth_m) | (depth > c.max_depth_m)
+        if c.method == "epipolar":
+            return np.where(refused | other_shape, np.inf, epipolar_px2), c.max_epipolar_px**2
+        # The poses' own noise moves the epipolar lines of near signs.
+        pose_px2 = (sights.focal[rows] / np.maximum(depth, c.min_depth_m)) ** 2
+        epipolar = epipolar_px2 / (c.sigma_px**2 + pose_px2 * self._pose_variance)
         # A tracklet that is known well enough to be predicted may break the epipolar gate: its last measurement may
         # have
         # been the wrong one.
@@ -212,10 +213,10 @@ class SignAssociator:
         sure = count >= c.sure_after
         refused |= ~sure & (epipolar > (c.max_epipolar_px / c.sigma_px) ** 2)
         epipolar = np.where(sure, np.minimum(epipolar, SURE_EPIPOLAR_COST), epipolar)
-        shape, track = sights.shape[rows], sights.track[rows]
+        track = sights.track[rows]
         hinted = (sights.track[old.last][:, None] == track) & (track >= 0)
         cost = innovation.distance_sq + innovation.vagueness + epipolar + c.young_penalty / count
-        cost += c.shape_penalty * (old.votes.argmax(-1)[:, None] != shape)
+        cost += c.shape_penalty * other_shape
         cost -= c.track_bonus * hinted
         cost[refused] = np.inf
         return cost, c.unmatched_cost

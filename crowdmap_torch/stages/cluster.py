@@ -114,8 +114,10 @@ def _cluster_paper(
             signs.center_world, radius=config.reach * scale, count=config.neighbours_paper
         )
         i, j = edge.T
-        # Triangulations of one journey are taken for distinct; a round only divides the clusters of the one before.
-        edge = edge[(signs.journey[i] != signs.journey[j]) & (label[i] == label[j])]
+        # Triangulations of one journey are taken for distinct, and so are those of different shapes; a round only
+        # divides the clusters of the one before.
+        distinct = (signs.journey[i] == signs.journey[j]) | (signs.shape[i] != signs.shape[j])
+        edge = edge[~distinct & (label[i] == label[j])]
         i, j = edge.T
         distance = (signs.center_world[i] - signs.center_world[j]).norm(dim=1)
         similarity = torch.exp(-0.5 * (distance / scale).square())

@@ -55,7 +55,10 @@ class SignTriangulationConfig:
     min_frames: int = 3
     """Tracklets with fewer detections of the tracklet's shape are pruned."""
     min_parallax_deg: float = 0.7
-    """Tracklets whose rays differ by less are pruned."""
+    """`joint`: tracklets whose rays differ by less are pruned."""
+    min_parallax_alone_deg: float = 8.0
+    """`paper2017`: the same of signs fitted one by one, which what drifts between the views moves the further the less their
+    rays differ."""
     max_distance_m: float = 80.0
     """Tracklets whose closest view is further away are pruned."""
     max_noise_scale: float = 3.9
@@ -335,10 +338,12 @@ def _fates(
     agreeing = group_sum(agrees, views.sign, n)
     is_doubtful = agreeing < config.doubtful_frames
     doubtful = min(config.max_doubtful_sigma_m, config.max_sigma_m)
+    is_alone = config.method == "paper2017"
+    parallax_deg = config.min_parallax_alone_deg if is_alone else config.min_parallax_deg
     low, high = config.size_m
     tests = (
         (BEHIND, group_sum(is_behind, views.sign, n) > 0),
-        (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(config.min_parallax_deg)),
+        (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(parallax_deg)),
         (TOO_FAR, away[closest_view(away, views.sign)] > config.max_distance_m),
         (SIZE, ((fit.size < low) | (fit.size > high)).any(-1)),
         (SIZE, fit.size.amax(-1) < config.min_side_m),

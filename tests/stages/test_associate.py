@@ -56,13 +56,31 @@ def test_every_sign_is_one_tracklet(centers, method):
     drive = drive_past(poses, signs_at(centers), shape=shape, noise_px=0.5)
     journey = replace(drive.journey, T_world_camera=noisy_poses(poses))
     tracklets = associate_signs(journey, replace(CONFIG, method=method))
-    if method == "predicted":
-        assert_one_tracklet_each(tracklets.label, drive.sign)
-        assert tracklets.count == len(centers)
-    else:
-        # Neighbours on a post are near one epipolar line when they are far ahead: the paper's cost alone may mix them.
-        pairs = tracklets_per_sign(tracklets.label, drive.sign)
-        assert sum(len(labels) for labels in pairs) <= 3 * len(centers)
+    assert_one_tracklet_each(tracklets.label, drive.sign)
+    assert tracklets.count == len(centers)
+
+
+def test_the_epipolar_cost_is_gated_by_motion():
+    """The next sign along the road comes into sight when one is passed: on its epipolar line, but not where it moves to."""
+    centers = [(3.0, 45.0, 2.0), (3.0, 57.0, 2.0)]
+    drive = drive_past(straight_poses(60), signs_at(centers), noise_px=0.5, depth_m=(20.0, 80.0))
+    frame = drive.journey.signs.frame
+    is_late = frame > frame[drive.sign == 0].max()
+    drive = with_rows(drive, ((drive.sign == 0) | is_late).nonzero()[:, 0])
+    config = replace(CONFIG, method="epipolar", window_frames=5)
+    tracklets = associate_signs(drive.journey, config)
+    assert_one_tracklet_each(tracklets.label, drive.sign)
+
+
+def test_the_epipolar_cost_is_gated_by_shape(generator):
+    poses = straight_poses(60)
+    drive = drive_past(poses, signs_at(ALONG_THE_ROAD), noise_px=0.5)
+    wrong = torch.rand(len(drive.sign), generator=generator) < 0.1
+    shape = torch.where(wrong, polygon.SHAPES.index("diamond"), drive.journey.signs.shape)
+    journey = replace(drive.journey, signs=replace(drive.journey.signs, shape=shape))
+    label = associate_signs(journey, replace(CONFIG, method="epipolar")).label
+    for tracklet in label.unique():
+        assert len(shape[label == tracklet].unique()) == 1
 
 
 def test_signs_of_one_shape_on_one_post_stay_apart():

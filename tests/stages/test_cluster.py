@@ -46,6 +46,15 @@ def test_paper_never_links_signs_of_one_journey(aligned: World):
     assert found.report.discarded == len(one)
 
 
+def test_paper_never_links_signs_of_different_shapes(aligned: World):
+    signs = aligned.crowd.signs
+    shape = torch.where(signs.journey % 2 == 0, 0, 2)
+    found = cluster_signs(replace(signs, shape=shape), PAPER).label
+    assert found.max() >= 0
+    for cluster in range(int(found.max()) + 1):
+        assert len(shape[found == cluster].unique()) == 1
+
+
 def test_second_round_only_divides_the_clusters_of_the_first(aligned: World):
     signs = aligned.crowd.signs
     first = cluster_signs(signs, replace(PAPER, scales_m=(4.0,), min_signs=1)).label

@@ -27,6 +27,7 @@ from crowdmap_torch.stages.associate import SignAssociationConfig, associate_sig
 from crowdmap_torch.stages.signs import (
     FEW_FRAMES,
     KEPT,
+    NO_PARALLAX,
     REASONS,
     REJOINED,
     SignReport,
@@ -174,10 +175,30 @@ def test_the_paper_does_not_rejoin_tracklets():
     frame = drive.journey.signs.frame
     drive = with_rows(drive, ((frame < 25) | (frame > 60)).nonzero()[:, 0])
     tracklets = associate_signs(drive.journey, SignAssociationConfig(window_frames=15))
-    config = SignTriangulationConfig(method="paper2017", max_sigma_m=5.0)
+    config = SignTriangulationConfig(
+        method="paper2017", max_sigma_m=5.0, min_parallax_alone_deg=0.7
+    )
     signs, report = triangulate_signs(drive.journey, tracklets, config)
     assert len(signs) == tracklets.count == 2
     assert not bool((report.reason == REJOINED).any())
+
+
+def test_signs_fitted_one_by_one_need_more_parallax():
+    drive = drive_past(straight_poses(50), signs_at([(3.5, 70.0, 2.2)]))
+    drive = with_rows(drive, (drive.journey.signs.frame < 37).nonzero()[:, 0])
+    frames = drive.journey.signs.frame.sort().values
+    at = drive.journey.T_world_camera[frames[[0, -1]], :3, 3]
+    ray = torch.nn.functional.normalize(drive.T_world_sign[0, :3, 3] - at, dim=1)
+    parallax_deg = float(torch.rad2deg((ray[0] @ ray[1]).acos()))
+    tracklets = by_truth(drive)
+    kept, _ = triangulate_signs(drive.journey, tracklets, SignTriangulationConfig())
+    assert len(kept) == 1
+    for share, reason in ((0.9, KEPT), (1.1, NO_PARALLAX)):
+        config = SignTriangulationConfig(
+            method="paper2017", min_parallax_alone_deg=share * parallax_deg
+        )
+        _, report = triangulate_signs(drive.journey, tracklets, config)
+        assert report.reason.tolist() == [reason]
 
 
 def test_an_unknown_method_is_refused():
