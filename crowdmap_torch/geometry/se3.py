@@ -25,14 +25,22 @@ def skew(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 def so3_exp(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a rotation vector [rad] (Rodrigues); value and derivatives are finite at zero."""
-    theta_sq = w.square().sum(-1)[..., None, None]
+    x, y, z = w.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    theta_sq = xx + yy + zz
     small = theta_sq < _SERIES_BELOW
     # Double `where`: the branch that is not taken must stay finite too, or its gradient turns into NaN.
     theta = torch.where(small, torch.ones_like(theta_sq), theta_sq).sqrt()
     a = torch.where(small, 1 - theta_sq / 6, theta.sin() / theta)
     b = torch.where(small, 0.5 - theta_sq / 24, (1 - theta.cos()) / theta.square())
-    W = skew(w)
-    return torch.eye(3, dtype=w.dtype, device=w.device) + a * W + b * (W @ W)
+    ax, ay, az = a * x, a * y, a * z
+    xy, xz, yz = b * x * y, b * x * z, b * y * z
+    rows = (
+        *(1 - b * (yy + zz), xy - az, xz + ay),
+        *(xy + az, 1 - b * (xx + zz), yz - ax),
+        *(xz - ay, yz + ax, 1 - b * (xx + yy)),
+    )
+    return torch.stack(rows, dim=-1).reshape(*w.shape[:-1], 3, 3)
 
 
 def so3_log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:

@@ -107,8 +107,17 @@ class _Workspace:
 
     store: Float[Tensor, "rows k"]
     """Per eliminated block and column of its window a row of `k`; once eliminated, whitened by its diagonal."""
+    couplings: dict[str, Float[Tensor, "f l k"]] = field(default_factory=dict)
+    """Of the last normal equations, by term."""
     factor: _Factor | None = None
     """Of the last solve."""
+
+    def coupling(self, name: str, rows: int, columns: int) -> Float[Tensor, "f l k"]:
+        """Memory for a term's couplings; what is in it is of no account."""
+        if name not in self.couplings:
+            shape = (rows, columns, self.store.shape[1])
+            self.couplings[name] = self.store.new_empty(shape)
+        return self.couplings[name]
 
 
 @dataclass(frozen=True)
@@ -442,7 +451,8 @@ def _assemble(
         cost = blocks.new_zeros(1)
         coupling = structure.couplings.get(name)
         if coupling is not None:
-            couplings[name] = blocks.new_zeros(len(coupling.block), coupling.column.shape[1], k)
+            mixed = workspace.coupling(name, len(coupling.block), coupling.column.shape[1])
+            couplings[name] = mixed if coupling.factor_of_row is None else mixed.zero_()
             term = term if coupling.order is None else rows(term, coupling.order)
         pieces = list(chunks(term, chunk_rows))
         parts = _computed(row_blocks, term, [piece for _, piece in pieces], kinds, values)

@@ -27,8 +27,8 @@ from crowdmap_torch.optim.problem import Problem, Values, retract
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
 _NEAR_BEST = 0.2
 """Steps that should be longer or shorter by less than this share stay as they are ..."""
-_NEAR_ENOUGH = 0.5
-"""... and those with a kept matrix by less than this: the next one learns from what is left."""
+_NEAR_ENOUGH = (0.5, 1.8)
+"""... and those with a kept matrix that should be within these multiples: the next one learns from what is left."""
 REASONS = (
     "still running",
     "converged: the cost no longer falls",
@@ -72,6 +72,8 @@ class _Place:
     """The step there by the kept matrix."""
     step: Mapping[str, Tensor]
     """The step that was taken from there."""
+    length: Tensor
+    """What multiple of the step proposed it is."""
 
 
 _Course = tuple[_Place, ...]
@@ -178,7 +180,7 @@ def step(
     course: _Course = ()
     keeps = bool((decrease <= config.reuse_below * normal.cost).all())
     if moved and keeps and isinstance(normal, ReusableEquations):
-        course = (_Place(normal, proposal.delta, _scaled(problem, proposal.delta, length)),)
+        course = (_Place(normal, proposal.delta, _scaled(problem, proposal.delta, length), length),)
     return replace(
         state,
         course=course,
@@ -209,11 +211,14 @@ def _step_on_course(problem: Problem, state: LmState, config: LmConfig) -> LmSta
     newton = normal.solve(state.damping)
     proposal = _quasi_newton(course, normal, newton)
     slope = normal.slope(proposal.delta)
-    length = torch.ones_like(slope)
+    # What the kept matrix has wrong about lengths it has wrong again.
+    length = course[-1].length
     candidate, there = _look(problem, state.values, normal, proposal.delta, length)
-    curvature = (there.slope(proposal.delta) - slope) / -slope
+    curvature = (there.slope(proposal.delta) - slope) / (-slope * length)
     best = 1 / curvature.clamp_min(1 / config.max_stretch)
-    if config.max_stretch > 1 and bool(((best - 1).abs() > _NEAR_ENOUGH).any()):
+    low, high = _NEAR_ENOUGH
+    is_near = (best > low * length) & (best < high * length)
+    if config.max_stretch > 1 and not bool(is_near.all()):
         other, there_too = _look(problem, state.values, normal, proposal.delta, best)
         if bool((there_too.cost < there.cost).all()):
             candidate, there, length = other, there_too, best
@@ -224,7 +229,7 @@ def _step_on_course(problem: Problem, state: LmState, config: LmConfig) -> LmSta
         return replace(state, accepted=torch.zeros_like(state.accepted))
     keeps = bool((decrease <= config.reuse_below * normal.cost).all())
     if keeps:
-        place = _Place(normal, newton.delta, _scaled(problem, proposal.delta, length))
+        place = _Place(normal, newton.delta, _scaled(problem, proposal.delta, length), length)
         state = replace(state, course=(*course, place)[-_MEMORY:], normal=there)
     done = (decrease <= config.cost_tolerance * normal.cost) & (state.reason == RUNNING)
     return replace(

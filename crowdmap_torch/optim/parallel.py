@@ -17,6 +17,8 @@ import torch
 
 _WORTH = 4
 """Items for each thread from which handing them over pays."""
+_AHEAD = 3
+"""Results for each thread that may be held: whoever takes them has other things to do too."""
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -43,7 +45,7 @@ def in_order(function: Callable[[T], R], items: Sequence[T], device: torch.devic
         try:
             for item in items:
                 waiting.append(pool.submit(run, item))
-                if len(waiting) > threads:
+                if len(waiting) > _AHEAD * threads:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
