@@ -72,8 +72,9 @@ class SignFitConfig:
     """What the car's course says of it."""
     tukey: float = 2.8
     """Detections with a root mean square whitened error beyond this many standard deviations have no say."""
-    tukey_alone: float = 4.685
-    """The same of signs fitted one by one, whose residuals hold the errors of the poses too."""
+    tukey_alone: float = 10.0
+    """The same of signs fitted one by one, whose residuals hold the errors of the poses too: those move the nearest views
+    most, which tell most."""
     typical_size_m: float = 0.75
     """Median width and height of signs."""
     sigma_log_size: float = 0.8

@@ -219,11 +219,14 @@ class MeasureReal:
         result = build_map(dataset, self.config)
         seconds = time.process_time() - begun
         alone = replace(result.hd_map, signs=result.journey_maps[0].signs)
-        final = certain_part(result.hd_map, self.config.min_confidence)
         ids = named_in(survey, read_observable_ids(self.eligible))
         measured = {
             name: evaluate_map(hd_map, survey, observable_ids=ids, gate_m=self.gate_m).as_dict()
-            for name, hd_map in (("journey", alone), ("map", final))
+            for name, hd_map in (
+                ("journey", alone),
+                ("heads", certain_part(result.map_clusters, self.config.min_confidence)),
+                ("map", certain_part(result.hd_map, self.config.min_confidence)),
+            )
         }
         frames = sum(journey.frame_count for journey in dataset.journeys)
         folder.write_result(self.key, {**measured, "frames": frames, "seconds": seconds})
