@@ -78,8 +78,9 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         text=(
             "kitti-signs: reference poses, boxes marked in the images, signs measured with LiDAR to about 6 cm; errors of "
             f"sign centres within {GATE_M:g} m. A sign that was passed twice counts by its better pass among one journey's "
-            "signs, by both passes together in the heads and after adjustment. Boxes are not exact corners, and there is one "
-            "journey in each sequence. Chawla et al. give 0.26 and 0.39 m of mean relative error, with poses estimated from the video.",
+            "signs, by both passes together in the heads and after adjustment. Boxes are not exact corners, and there is "
+            "one journey in each sequence. Chawla et al. give 0.26 and 0.39 m of mean relative error, with poses "
+            "estimated from the video.",
         ),
         tables=(Table("real", columns, tuple(rows)),),
     )
