@@ -46,6 +46,11 @@ class AdjustConfig:
     """Least standard deviation of a sign corner of a large box; more where the residuals say so."""
     box_sigma: float = 0.5
     """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, as a share of them."""
+    size_classes_m: tuple[tuple[float, float], ...] = ()
+    """Widths and heights that signs are made in: one that is near such a size is drawn to it, others are not. None: sizes
+    are what the images say."""
+    size_class_sigma: float = 0.005
+    """1-sigma of the width and height of signs about their class, as a share."""
     lane_sigma_px: float = 0.8
     """Least standard deviation of a lane point across the marker."""
     lane_correlation: float = 1.0
@@ -76,6 +81,17 @@ class AdjustConfig:
     gradients, matrix-free, and their covariances estimated from samples."""
     covariance_samples: int = 64
     """Samples of the map that such covariances are estimated from; their sigmas are then good to 9 %."""
+
+    def __post_init__(self) -> None:
+        """Refuses size classes that no sign can have."""
+        if any(side <= 0 for sides in self.size_classes_m for side in sides):
+            raise ValueError(
+                f"size_classes_m: expected positive widths and heights in metres, found {self.size_classes_m}"
+            )
+        if self.size_class_sigma <= 0:
+            raise ValueError(
+                f"size_class_sigma: expected a positive share, found {self.size_class_sigma}"
+            )
 
 
 class Bundle(nn.Module):
@@ -137,6 +153,8 @@ class Bundle(nn.Module):
         self.beside = beside
         """The pose nearest to each lane coefficient at the start."""
         self.slide_slots: tuple[tuple[str, Tensor], ...] = ()
+        sizes = values["size"]
+        self.size_slots = (("size", torch.arange(len(sizes), device=sizes.device)),)
 
     def values(self) -> dict[str, Tensor]:
         """Base values moved by the increments."""
@@ -246,6 +264,7 @@ class Bundle(nn.Module):
         terms = {**self.prior.terms(self.prior_scale), **self.fixed}
         if held and self.held is not None:
             terms["lane_slide"] = self.held
+        terms.update(self._size_term())
         terms.update(self._corner_term(self.corner_sigma()))
         terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))
         return Problem(self.variables, terms)
@@ -271,6 +290,22 @@ class Bundle(nn.Module):
             residual_blocks.sign_reprojection_blocks,
         )
         return {"sign_reprojection": term}
+
+    def _size_term(self) -> dict[str, CostTerm]:
+        size = self.values()["size"].detach()
+        classes = size.new_tensor(self.config.size_classes_m)
+        if not len(classes) or not len(size):
+            return {}
+        away = (size[:, None] / classes).log().square().sum(-1)
+        term = CostTerm(
+            residuals.size_class,
+            self.size_slots,
+            (classes[away.argmin(1)],),
+            size.new_full((len(size),), 1 / self.config.size_class_sigma),
+            Tukey(self.config.tukey_c),
+            residuals.size_class_jacobian,
+        )
+        return {"size_class": term}
 
     def _lane_terms(self, sigma: float) -> dict[str, CostTerm]:
         rows = self.lane_points

@@ -117,6 +117,11 @@ def lane_prior(
     return R_world_lane.mT @ (coefficient - start)
 
 
+def size_class(size: Float[Tensor, " 2"], usual: Float[Tensor, " 2"]) -> Float[Tensor, " 2"]:
+    """How far a sign's width and height are from a usual size, as logarithms."""
+    return (size / usual).log()
+
+
 def lane_stretch(
     c0: Float[Tensor, " 3"],
     c1: Float[Tensor, " 3"],
@@ -288,6 +293,14 @@ def lane_prior_jacobian(
     """`lane_prior` and its Jacobian by the coefficient."""
     R_t = R_world_lane.mT
     return (R_t @ (coefficient - start)[..., None])[..., 0], (R_t,)
+
+
+def size_class_jacobian(
+    size: Float[Tensor, "m 2"], usual: Float[Tensor, "m 2"]
+) -> tuple[Float[Tensor, "m 2"], tuple[Tensor]]:
+    """`size_class` and its Jacobian by relative changes of the size."""
+    eye = torch.eye(2, dtype=size.dtype, device=size.device)
+    return (size / usual).log(), (eye.expand(len(size), 2, 2),)
 
 
 def lane_stretch_jacobian(

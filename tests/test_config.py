@@ -93,7 +93,21 @@ def test_lists_become_tuples_of_numbers(load):
     assert config.lane_association.reach_m == (3.0, 40.0)
 
 
-@pytest.mark.parametrize("text", ["", "seed: 3", "method: paper2017", "lane: {}"])
+def test_lists_of_lists_become_tuples_of_tuples(load):
+    config = load("adjust: {size_classes_m: [[0.6, 0.6], [1, 0.75]]}")
+    assert config.adjust.size_classes_m == ((0.6, 0.6), (1.0, 0.75))
+
+
+@pytest.mark.parametrize("sizes", ["[0.6, 0.6]", "[[0.6]]", "[[0.6, -0.6]]"])
+def test_size_classes_come_as_positive_pairs(load, sizes: str):
+    with pytest.raises(ValueError, match=r"size_classes_m.*expected"):
+        load(f"adjust: {{size_classes_m: {sizes}}}")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "seed: 3", "method: paper2017", "lane: {}", "adjust: {size_classes_m: [[0.6, 0.6]]}"],
+)
 def test_dump_then_load_gives_the_same_configuration(load, text: str):
     config = load(text)
     assert load(dump(config)) == config

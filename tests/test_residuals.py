@@ -114,6 +114,14 @@ def test_lane_height_and_prior_jacobians_equal_autograd(scene, generator):
         (add,),
         (coefficients[0], T_world_camera[:, :3, :3]),
     )
+    sizes = 0.5 + torch.rand(2, M, 2, dtype=torch.float64, generator=generator)
+    check(
+        residuals.size_class,
+        residuals.size_class_jacobian,
+        (sizes[0],),
+        (positive,),
+        (sizes[1],),
+    )
     check(
         residuals.lane_slide,
         residuals.lane_slide_jacobian,
