@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.chain import ChainNormalEquations, add_link, chain_equations, same_rows
+from crowdmap_torch.optim.chain import ChainNormalEquations, chain_equations
 from crowdmap_torch.optim.chain_structure import ChainStructure, analyse
+from crowdmap_torch.optim.chain_sums import add_link, same_rows
 from crowdmap_torch.optim.linear import DIAGONAL_FLOOR, Step
 from crowdmap_torch.optim.linearize import CHUNK_ROWS, chunks, linearize
 from crowdmap_torch.optim.problem import Problem, Values
