@@ -21,10 +21,11 @@ from crowdmap_torch.optim.problem import CostTerm, Problem, Variable
 from crowdmap_torch.optim.robust import Tukey, median_scale
 from crowdmap_torch.pixel_noise import noise_by_box, shared_error
 from crowdmap_torch.pose_prior import PosePrior, PosePriorConfig
+from crowdmap_torch.sign_habit import SignHabit
 
 _NARROWS = 0.97
 """A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
-_SCALE_RESTS = 0.02
+_SCALE_RESTS = 0.005
 """A scale of the prior that would change by less than this share is at rest."""
 
 
@@ -46,6 +47,8 @@ class AdjustConfig:
     """Least standard deviation of a sign corner of a large box; more where the residuals say so."""
     box_sigma: float = 0.5
     """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, as a share of them."""
+    habit: SignHabit = field(default_factory=SignHabit)
+    """What signs are like before anything is seen of them."""
     size_classes_m: tuple[tuple[float, float], ...] = ()
     """Widths and heights that signs are made in: one that is near such a size is drawn to it, others are not. None: sizes
     are what the images say."""

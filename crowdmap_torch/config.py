@@ -84,8 +84,18 @@ class MapperConfig:
             road=replace(self.road, method="paper2017"),
             lane=replace(self.lane, method="paper2017"),
             crowd=replace(self.crowd, method="paper2017"),
-            # eq:ba weighs all pixels alike, and knows no road under its lanes.
-            adjust=replace(self.adjust, lane_height_sigma_m=math.inf, lane_correlation=1.0),
+            # eq:ba weighs all pixels alike, and knows neither what signs are like nor a road under its lanes.
+            adjust=replace(
+                self.adjust,
+                habit=replace(
+                    self.adjust.habit,
+                    facing_rad=math.inf,
+                    upright_rad=math.inf,
+                    log_size=math.inf,
+                ),
+                lane_height_sigma_m=math.inf,
+                lane_correlation=1.0,
+            ),
         )
 
 

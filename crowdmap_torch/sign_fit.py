@@ -34,12 +34,11 @@ from crowdmap_torch.pose_drift import (
     knot_count,
     places_on_path,
 )
+from crowdmap_torch.sign_habit import SignHabit, habit_term
 from crowdmap_torch.sign_view import (
     corner_errors,
     drifting_sign_view,
     drifting_sign_view_jacobian,
-    sign_habit,
-    sign_habit_jacobian,
     sign_view,
     sign_view_jacobian,
 )
@@ -51,7 +50,7 @@ APPROACH_FRAMES = 150
 
 @dataclass(frozen=True)
 class SignFitConfig:
-    """Noise of detections and poses, and what signs are like before anything is seen of them."""
+    """Noise of detections and poses, what signs are like, and the minimisation."""
 
     sigma_px: float = 0.6
     """Noise of each corner of a large detection, per axis [px]."""
@@ -75,14 +74,8 @@ class SignFitConfig:
     tukey_alone: float = 10.0
     """The same of signs fitted one by one, whose residuals hold the errors of the poses too: those move the nearest views
     most, which tell most."""
-    typical_size_m: float = 0.75
-    """Median width and height of signs."""
-    sigma_log_size: float = 0.8
-    """Spread of the logarithms of width and height."""
-    sigma_facing_rad: float = 0.5
-    """Spread of the angle between a sign's normal and the direction it is driven at."""
-    sigma_upright_rad: float = 0.1
-    """Spread of roll and tilt."""
+    habit: SignHabit = field(default_factory=SignHabit)
+    """What signs are like before anything is seen of them."""
     rounds: int = 2
     """How often the views' own pose errors are estimated and the fit is repeated."""
     lm: lm.LmConfig = field(
@@ -321,15 +314,7 @@ def _problem(
             loss=Tukey(config.tukey * (2 * c) ** 0.5),
             jacobian=sign_view_jacobian,
         )
-    angles = (config.sigma_facing_rad, config.sigma_upright_rad, config.sigma_upright_rad)
-    sigma = facing.new_tensor((*angles, config.sigma_log_size, config.sigma_log_size))
-    terms["habit"] = CostTerm(
-        sign_habit,
-        (("sign", own), ("size", own)),
-        (facing, torch.full_like(start.size, config.typical_size_m)),
-        weight=(1 / sigma).expand(len(own), 5),
-        jacobian=sign_habit_jacobian,
-    )
+    terms["habit"] = habit_term(facing, own, config.habit)
     values = {"sign": start.T_world_sign, "size": start.size}
     return Problem(variables, terms, group_count=len(own)), values
 

@@ -98,12 +98,6 @@ def starts(
     return found
 
 
-def against_the_drive(views: SignViews, count: int) -> Float[Tensor, "count 3"]:
-    """Horizontal direction against the mean optical axis of each sign's views: where it probably faces."""
-    axis = views.T_world_camera[:, :3, 2] * views.T_world_camera.new_tensor([1.0, 1.0, 0.0])
-    return -torch.nn.functional.normalize(group_sum(axis, views.sign, count), dim=-1)
-
-
 def _mean_ray(views: SignViews) -> Float[Tensor, "m 3"]:
     low, high = views.corners_ideal.amin(1), views.corners_ideal.amax(1)
     middle = torch.nn.functional.pad((low + high) / 2, (0, 1), value=1.0)

@@ -92,48 +92,6 @@ def drifting_sign_view_jacobian(
     )
 
 
-def sign_habit(
-    T_world_sign: Float[Tensor, "4 4"],
-    size: Float[Tensor, " 2"],
-    facing: Float[Tensor, " 3"],
-    typical_size: Float[Tensor, " 2"],
-) -> Float[Tensor, " 5"]:
-    """How unusual a sign is, as small angles and logarithms: it faces the drive, stands upright and has a usual size."""
-    R = T_world_sign[:3, :3]
-    right = facing @ R[:, 0]
-    log_size = (size / typical_size).log()
-    return torch.stack((right, R[2, 0], R[2, 2], log_size[0], log_size[1]))
-
-
-def sign_habit_jacobian(
-    T_world_sign: Float[Tensor, "n 4 4"],
-    size: Float[Tensor, "n 2"],
-    facing: Float[Tensor, "n 3"],
-    typical_size: Float[Tensor, "n 2"],
-) -> tuple[Float[Tensor, "n 5"], tuple[Tensor, Tensor]]:
-    """`sign_habit` and its Jacobians by sign pose and relative size."""
-    R = T_world_sign[:, :3, :3]
-    across = (R * facing[..., None]).sum(1)
-    up = R[:, 2]
-    log_size = (size / typical_size).log()
-    habit = torch.cat((across[:, :1], up[:, :1], up[:, 2:], log_size), dim=-1)
-    zero = torch.zeros_like(up[:, 0])
-    # A turn by w takes the axes x and z to x + w_z y - w_y z and z + w_y x - w_x y.
-    by_turn = torch.stack(
-        (
-            torch.stack((zero, -across[:, 2], across[:, 1]), dim=-1),
-            torch.stack((zero, -up[:, 2], up[:, 1]), dim=-1),
-            torch.stack((-up[:, 1], up[:, 0], zero), dim=-1),
-        ),
-        dim=1,
-    )
-    by_size = torch.eye(5, 2, dtype=size.dtype, device=size.device).roll(3, 0)
-    return habit, (
-        torch.nn.functional.pad(by_turn, (3, 0, 0, 2)),
-        by_size.expand(len(size), 5, 2),
-    )
-
-
 def corner_errors(
     T_world_camera: Float[Tensor, "m 4 4"],
     T_world_sign: Float[Tensor, "m 4 4"],

@@ -28,8 +28,6 @@ from crowdmap_torch.sign_fit import (
 from crowdmap_torch.sign_view import (
     drifting_sign_view,
     drifting_sign_view_jacobian,
-    sign_habit,
-    sign_habit_jacobian,
     sign_view,
     sign_view_jacobian,
 )
@@ -56,21 +54,6 @@ def views_of(drive) -> SignViews:
         observation=cameras.observation_matrix(CAMERA, px, ideal),
         T_world_camera=drive.journey.T_world_camera[signs.frame],
     )
-
-
-def test_the_habits_jacobian_is_that_of_autograd(generator):
-    T = se3.retract(signs_at([(1.0, 2.0, 3.0)]), torch.full((1, 6), 0.2, dtype=F64))
-    size, typical = torch.rand(2, 1, 2, dtype=F64, generator=generator) + 0.5
-
-    def habit(xi, log_size):
-        moved = se3.retract(T[0], xi)
-        return sign_habit(moved, positive(size[0], log_size), FACING_SOUTH, typical[0])
-
-    zeros = torch.zeros(6, dtype=F64), torch.zeros(2, dtype=F64)
-    value, found = sign_habit_jacobian(T, size, FACING_SOUTH[None], typical)
-    torch.testing.assert_close(value[0], habit(*zeros))
-    for exact, J in zip(jacfwd(habit, (0, 1))(*zeros), found, strict=True):
-        torch.testing.assert_close(J[0], exact)
 
 
 def start_of(drive, generator, *, push: float = 0.1) -> SignStart:

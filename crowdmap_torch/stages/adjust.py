@@ -32,6 +32,7 @@ from crowdmap_torch.observations import (
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm, Variable, euclidean, positive
 from crowdmap_torch.pose_prior import drift_nodes, pose_prior
+from crowdmap_torch.sign_habit import against_the_drive, habit_term
 from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Signs
 
 
@@ -103,6 +104,11 @@ def build(
         "lane": Variable(3, euclidean),
     }
     fixed = _lane_prior(values["lane"], lanes, config)
+    if len(corners):
+        facing = against_the_drive(values["pose"][corners.frame], corners.sign, len(signs))
+        # Signs that nobody sees stay as they are.
+        own = corners.sign.unique()
+        fixed["sign_habit"] = habit_term(facing[own], own, config.habit)
     if control is not None and len(control):
         fixed["control"] = _control_term(control, signs)
     tree = KDTree(values["pose"][:, :3, 3].cpu().numpy()) if len(frame) else None

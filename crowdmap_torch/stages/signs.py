@@ -24,8 +24,9 @@ from crowdmap_torch.sign_fit import (
     fit_signs_coarsely,
     robust_noise_scale,
 )
+from crowdmap_torch.sign_habit import against_the_drive
 from crowdmap_torch.sign_rejoin import RejoinConfig, rejoin, relabelled
-from crowdmap_torch.sign_start import against_the_drive, centre_points, starts
+from crowdmap_torch.sign_start import centre_points, starts
 from crowdmap_torch.tables import Journey, Signs, Tracklets, concatenate
 
 METHODS = ("joint", "paper2017")
@@ -200,10 +201,10 @@ def _fit_alone(
     label, sign = tracklets.label[rows].unique(return_inverse=True)
     views = _views(journey, tracklets, rows, sign)
     drive = drive_path(journey, config.fit.course, config.fit.drift)
-    centre = centre_points(views, len(label), typical_height_m=config.fit.typical_size_m)
+    centre = centre_points(views, len(label), typical_height_m=config.fit.habit.typical_size_m)
     # The last is the best plane through the mid-points of the corners, or an upright sign where they have none.
     best = starts(views, shape[label], centre, yaws=(0.0,), size_limits=config.size_m)[-1]
-    facing = against_the_drive(views, len(label))
+    facing = against_the_drive(views.T_world_camera, views.sign, len(label))
     fit = fit_signs_alone(views, shape[label], best, facing, drive, config.fit)
     usual = torch.ones_like(fit.size[:, 0])
     return _Fitted(tracklets, label[:0], label, rows, views, fit, usual)
@@ -255,8 +256,8 @@ def _begin(
     n = len(shape)
     few = views[_thinned(views, config.start_views)]
     m = len(few)
-    centre = centre_points(few, n, typical_height_m=config.fit.typical_size_m)
-    facing = against_the_drive(few, n)
+    centre = centre_points(few, n, typical_height_m=config.fit.habit.typical_size_m)
+    facing = against_the_drive(few.T_world_camera, few.sign, n)
     yaws = tuple(math.radians(yaw) for yaw in config.start_yaw_deg)
     begin = starts(few, shape, centre, yaws=yaws, size_limits=config.size_m)
     k = len(begin)
@@ -302,7 +303,7 @@ def _fit(
     drive: DrivePath,
     config: SignTriangulationConfig,
 ) -> SignFit:
-    facing = against_the_drive(views, len(shape))
+    facing = against_the_drive(views.T_world_camera, views.sign, len(shape))
     return fit_signs(views, shape, start, facing, scale, drive, config.fit)
 
 
