@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,6 +12,7 @@ from crowd_world import World, make_world, pair_scores, shuffled
 from crowdmap_torch.clustering.spectral import same_partition
 from crowdmap_torch.crowd import CrowdConfig, associate_crowd, unbiased_signs
 from crowdmap_torch.crowd_signs import pairs_seen_together
+from crowdmap_torch.geometry import se3
 from crowdmap_torch.similarity import mahalanobis
 from crowdmap_torch.stages.cluster import SignClusterConfig, cluster_signs, moved
 from crowdmap_torch.stages.existence import ExistenceConfig, existence
@@ -114,6 +116,21 @@ def test_bad_drives_are_named_and_good_ones_are_not():
     good = ~torch.isin(world.crowd.signs.journey, torch.tensor([2, 5]))
     precision, recall = pair_scores(replace(world, sign=world.sign[good]), crowd.label[good])
     assert min(precision, recall) > 0.97
+
+
+@pytest.mark.parametrize(("roll_deg", "named"), [(2.5, [3]), (-2.5, [3]), (1.0, [])])
+def test_a_camera_that_is_rolled_is_named(roll_deg: float, named: list[int]):
+    """As its signs are, in their planes; a degree may be the mount's."""
+    world = make_world(9, journeys=10)
+    signs = world.crowd.signs
+    T = signs.T_world_sign.clone()
+    turn = torch.tensor([0.0, 0.0, math.radians(roll_deg)]).double()
+    mine = signs.journey == 3
+    T[mine, :3, :3] = T[mine, :3, :3] @ se3.so3_exp(turn)
+    rolled = replace(world.crowd, signs=replace(signs, T_world_sign=T))
+    crowd = associate_crowd(rolled, CrowdConfig())
+    assert [s.journey for s in crowd.report.suspects] == named
+    assert all(f"rolled by {roll_deg:.1f} degrees" in s.reason for s in crowd.report.suspects)
 
 
 def test_leaping_positions_are_named():

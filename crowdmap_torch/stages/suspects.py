@@ -28,6 +28,8 @@ class SuspectConfig:
     """Median miss of its signs, bias and drift taken off, that is never suspicious below [m]."""
     min_turn_deg: float = 2.0
     """Median turn of its signs against the crowd's that is never suspicious below [deg]."""
+    min_roll_deg: float = 1.5
+    """Median roll of its signs in their planes against the crowd's that is never suspicious below [deg]."""
     min_stretch: float = 0.035
     """Median relative size against the crowd's that is never suspicious below."""
     min_drift_m: float = 1.25
@@ -58,6 +60,8 @@ class JourneyStatistics:
     """Median distance of its signs from the clusters, bias and drift taken off [m]."""
     turn: Float[Tensor, " j"]
     """Median turn of its signs about the up axis against their clusters [rad]."""
+    roll: Float[Tensor, " j"]
+    """Median turn of its signs in their planes against their clusters [rad]."""
     stretch: Float[Tensor, " j"]
     """Median logarithm of the size of its signs against their clusters'."""
     drift: Float[Tensor, " j"]
@@ -89,6 +93,9 @@ def journey_statistics(
     miss = (member.center_world - head.center_world).norm(dim=1)
     a, b = member.normal_world, head.normal_world
     turn = torch.atan2(b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0], (a[:, :2] * b[:, :2]).sum(1))
+    R, axes = member.T_world_sign[:, :3, :3], head.T_world_sign[:, :3, :3]
+    along = (axes.mT @ R[:, :, :1])[..., 0]
+    roll = torch.atan2(along[:, 1], along[:, 0])
     stretch = (member.size.log() - head.size.log()).mean(1)
     centre = translation.median(0).values if journeys else translation.sum(0)
     return JourneyStatistics(
@@ -97,6 +104,7 @@ def journey_statistics(
         bias=(translation - centre).norm(dim=1),
         scatter=group_median(miss, member.journey, journeys),
         turn=group_median(turn, member.journey, journeys),
+        roll=group_median(roll, member.journey, journeys),
         stretch=group_median(stretch, member.journey, journeys),
         drift=drift,
         leap=leap,
@@ -128,6 +136,11 @@ def suspect_journeys(
             _outlying(statistics.turn, judged, torch.pi / 180 * config.min_turn_deg, config.spread),
             torch.rad2deg(statistics.turn),
             "its signs are turned by {:.1f} degrees against the others'",
+        ),
+        (
+            _outlying(statistics.roll, judged, torch.pi / 180 * config.min_roll_deg, config.spread),
+            torch.rad2deg(statistics.roll),
+            "its signs are rolled by {:.1f} degrees against the others'",
         ),
         (
             _outlying(statistics.stretch, judged, config.min_stretch, config.spread),
