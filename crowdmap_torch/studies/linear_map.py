@@ -63,11 +63,14 @@ def linear_map(
     """
     shown = torch.cat([_shown(t) for t in truth.journeys])
     row = torch.unique(shown[shown >= 0])
-    of_survey = torch.full((len(true_signs),), -1)
-    of_survey[row] = torch.arange(len(row))
+    bundle = _bundle_at_truth(truth, survey, true_signs, row)
+    seen = bundle.corners.sign.unique()
+    if len(seen) < len(row):
+        # Frames at a standstill are thinned: some signs may have no detection left.
+        row = row[seen]
+        bundle = _bundle_at_truth(truth, survey, true_signs, row)
     signs = true_signs[row]
-    bundle = _bundle_at_truth(truth, survey, signs, of_survey)
-    information, force = _prior_of_lanes(bundle)
+    information, force = _prior(bundle)
     for number, journey in enumerate(truth.journeys):
         own, push = _of_journey(bundle, truth, number, journey, simulation)
         information += own
@@ -93,8 +96,13 @@ def _shown(truth: JourneyTruth) -> Int[Tensor, " d"]:
     return torch.where(truth.sign_outlier[row], -1, truth.sign[row])
 
 
-def _bundle_at_truth(truth: Truth, survey: Survey, signs: Signs, of_survey: Tensor) -> Bundle:
-    """All observations with their true landmarks, started at the truth."""
+def _bundle_at_truth(
+    truth: Truth, survey: Survey, true_signs: Signs, row: Int[Tensor, " n"]
+) -> Bundle:
+    """All observations of the signs `row` and of lanes with their true landmarks, started at the truth."""
+    of_survey = torch.full((len(true_signs),), -1)
+    of_survey[row] = torch.arange(len(row))
+    signs = true_signs[row]
     journeys = [t.journey for t in truth.journeys]
     roads = [
         RoadEstimate(
@@ -165,10 +173,9 @@ def _true_lanes(survey: Survey) -> Lanes:
     )
 
 
-def _prior_of_lanes(bundle: Bundle) -> tuple[Tensor, Tensor]:
-    """Information and force on the landmarks by what holds lanes where nothing observes them."""
-    terms = [term for name, term in bundle.fixed.items() if name.startswith("lane")]
-    return _normal_equations(bundle, terms, poses=0, first_pose=0)
+def _prior(bundle: Bundle) -> tuple[Tensor, Tensor]:
+    """Information and force on the landmarks by what holds them where observations do not, as in our adjustment."""
+    return _normal_equations(bundle, list(bundle.fixed.values()), poses=0, first_pose=0)
 
 
 def _columns(bundle: Bundle) -> dict[str, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,26 @@ def test_the_map_is_not_better_than_the_bound(
     # What our map says of what all share is what the bound says.
     theirs, mine = (s.trace().sqrt() for s in (found.shared, tiny_result.hd_map.shared_covariance))
     assert float(mine / theirs) == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_sign_seen_once_or_never_spoils_nothing(
+    found: LinearMap, tiny_truth: Truth, tiny_survey: Survey, true_signs: Signs
+):
+    """Once: what is usual of signs makes up for what one view leaves open."""
+    once, never = found.row[:2].tolist()
+    is_first = True
+    journeys = []
+    for journey in tiny_truth.journeys:
+        left_out = journey.sign_outlier | (journey.sign == never)
+        of_once = torch.nonzero((journey.sign == once) & ~left_out)[:, 0]
+        left_out[of_once[1:] if is_first else of_once] = True
+        is_first = is_first and not len(of_once)
+        journeys.append(replace(journey, sign_outlier=left_out))
+    few = linear_map(Truth(tuple(journeys)), tiny_survey, true_signs, SimulationConfig())
+    assert few.row.tolist() == [row for row in found.row.tolist() if row != never]
+    assert bool(few.signs.T_world_sign.isfinite().all())
+    variance = few.signs.covariance.diagonal(dim1=1, dim2=2).sum(1)
+    assert variance[0] > 2 * variance[1:].max()
 
 
 def test_poses_err_by_bias_drift_and_noise():
