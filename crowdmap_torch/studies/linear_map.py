@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.bundle import AdjustConfig, Bundle
+from crowdmap_torch.evaluation.visibility import observable_signs
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.io.truth import JourneyTruth, Truth
 from crowdmap_torch.observations import CornerObservations
@@ -50,7 +51,7 @@ class LinearMap:
     row: Int[Tensor, " n"]
     """The survey's sign of each."""
     shared: Float[Tensor, "3 3"]
-    """Mean covariance between any two centres [m^2]."""
+    """Mean covariance between any two centres of observable signs [m^2]."""
 
 
 @torch.no_grad()
@@ -80,7 +81,10 @@ def linear_map(
     n = len(signs)
     pose, size = delta[: 6 * n].view(n, 6), delta[6 * n : 8 * n].view(n, 2)
     at = 6 * torch.arange(n)[:, None] + torch.arange(3)
-    shared = covariance[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
+    # A sign seen once or twice is metres off: it has no part in what all share.
+    often = at[observable_signs(truth, survey.signs)[row]]
+    often = (often if len(often) else at).T
+    shared = covariance[often[:, None, :, None], often[None, :, None, :]].mean((-1, -2))
     moved = replace(
         signs,
         T_world_sign=se3.retract(signs.T_world_sign, pose),
