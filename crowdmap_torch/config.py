@@ -17,6 +17,7 @@ import yaml
 from crowdmap_torch.bundle import AdjustConfig
 from crowdmap_torch.control import ControlConfig
 from crowdmap_torch.crowd import CrowdConfig
+from crowdmap_torch.sign_habit import SignHabit
 from crowdmap_torch.stages.associate import SignAssociationConfig
 from crowdmap_torch.stages.associate_lanes import LaneAssociationConfig
 from crowdmap_torch.stages.cluster_lanes import LaneClusterConfig
@@ -87,12 +88,7 @@ class MapperConfig:
             # eq:ba weighs all pixels alike, and knows neither what signs are like nor a road under its lanes.
             adjust=replace(
                 self.adjust,
-                habit=replace(
-                    self.adjust.habit,
-                    facing_rad=math.inf,
-                    upright_rad=math.inf,
-                    log_size=math.inf,
-                ),
+                habit=SignHabit(facing_rad=math.inf, upright_rad=math.inf, log_size=math.inf),
                 lane_height_sigma_m=math.inf,
                 lane_correlation=1.0,
             ),

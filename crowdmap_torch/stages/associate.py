@@ -207,8 +207,7 @@ class SignAssociator:
         pose_px2 = (sights.focal[rows] / np.maximum(depth, c.min_depth_m)) ** 2
         epipolar = epipolar_px2 / (c.sigma_px**2 + pose_px2 * self._pose_variance)
         # A tracklet that is known well enough to be predicted may break the epipolar gate: its last measurement may
-        # have
-        # been the wrong one.
+        # have been the wrong one.
         count = old.votes.sum(-1)[:, None]
         sure = count >= c.sure_after
         refused |= ~sure & (epipolar > (c.max_epipolar_px / c.sigma_px) ** 2)
