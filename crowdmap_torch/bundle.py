@@ -262,9 +262,15 @@ class Bundle(nn.Module):
             jacobian=residuals.lane_slide_jacobian,
         )
 
-    def problem(self, *, held: bool = True) -> Problem:
-        """The least-squares problem with the matches and scales of the moment; lanes `held` where they are, or not."""
-        terms = {**self.prior.terms(self.prior_scale), **self.fixed}
+    def problem(
+        self, *, held: bool = True, prior_scale: Float[Tensor, "j 3"] | None = None
+    ) -> Problem:
+        """The least-squares problem with the matches and scales of the moment; lanes `held` where they are, or not.
+
+        `prior_scale` stands for the bundle's own where it is given.
+        """
+        scale = self.prior_scale if prior_scale is None else prior_scale
+        terms = {**self.prior.terms(scale), **self.fixed}
         if held and self.held is not None:
             terms["lane_slide"] = self.held
         terms.update(self._size_term())

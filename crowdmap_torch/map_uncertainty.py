@@ -93,7 +93,8 @@ def map_uncertainty(
     values = bundle.values()
     nodes = bundle.prior.nodes
     journeys = len(values["bias"])
-    problem = bundle.problem(held=False)
+    expected = bundle.prior.expected_scale(values["drift"], bundle.prior_scale)
+    problem = bundle.problem(held=False, prior_scale=expected)
     normal = bundle.backend().assemble(problem, values)
     to_bias = _to_bias(values["pose"][nodes.first])
     count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)

@@ -155,6 +155,23 @@ class PosePrior:
         `drift` is the estimated one. What all journeys share is taken off, and costs its degrees of freedom (restricted
         maximum likelihood); a journey's scale is drawn towards the fleet's, and that towards one.
         """
+        return self._scales(drift, scale)[0]
+
+    def expected_scale(
+        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"]
+    ) -> Float[Tensor, "j 3"]:
+        """`rescaled` as covariances need it: the root of the mean that a scale's square has, not of its median.
+
+        A variance found from few numbers may well be larger than it seems: what rests on it has Student's covariance,
+        wider than a normal's by `n / (n - 2)` of n degrees of freedom (Gelman et al., Bayesian Data Analysis, 3.2).
+        """
+        found, wider = self._scales(drift, scale)
+        return found * wider.sqrt()
+
+    def _scales(
+        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"]
+    ) -> tuple[Float[Tensor, "j 3"], Float[Tensor, "j 3"]]:
+        """The scales, and for each the mean of its square over the median."""
         journeys, own = len(scale), self.nodes.journey
         first, second = self.far.unbind(1)
         change = (drift[second] - drift[first]).square()
@@ -168,22 +185,25 @@ class PosePrior:
         mean = self.nodes.mean(drift[:, :3], journeys)
         seen = count.clamp_max(1).expand(-1, 3)
         bias, moves, turns = scale.square().unbind(1)
-        likely = drift.new_ones(3)
+        likely, wider = drift.new_ones(3), torch.ones_like(scale)
         slides, rolls = self.drift_sigma.square().split(3, dim=1)
         for _ in range(_SWEEPS):
-            moves, of_moves = self._pooled(
+            moves, of_moves, moves_wider = self._pooled(
                 likely[1], changes[:, :3], pairs, moves[:, None] * slides
             )
-            turns, of_turns = self._pooled(likely[2], changes[:, 3:], pairs, turns[:, None] * rolls)
+            turns, of_turns, turns_wider = self._pooled(
+                likely[2], changes[:, 3:], pairs, turns[:, None] * rolls
+            )
             spread = (
                 bias[:, None] * self.bias_sigma[:, :3].square() + moves[:, None] * slow * slides
             )
             weight = seen / spread
             common = (weight * mean).sum(0) / weight.sum(0).clamp_min(1e-12)
             squares = seen * bias[:, None] * (mean - common).square() / spread
-            bias, of_bias = self._pooled(likely[0], squares, seen, spread)
+            bias, of_bias, bias_wider = self._pooled(likely[0], squares, seen, spread)
             likely = torch.stack((of_bias, of_moves, of_turns))
-        return torch.stack((bias, moves, turns), dim=1).sqrt()
+            wider = torch.stack((bias_wider, moves_wider, turns_wider), dim=1)
+        return torch.stack((bias, moves, turns), dim=1).sqrt(), wider
 
     def _pooled(
         self,
@@ -191,8 +211,11 @@ class PosePrior:
         squares: Float[Tensor, "j 3"],
         count: Float[Tensor, "j 3"],
         variance: Float[Tensor, "j 3"],
-    ) -> tuple[Float[Tensor, " j"], Float[Tensor, ""]]:
-        """Variance scales of journeys from sums of squares in units of the given sigmas; the fleet's `likely` one, anew."""
+    ) -> tuple[Float[Tensor, " j"], Float[Tensor, ""], Float[Tensor, " j"]]:
+        """Variance scales of journeys from sums of squares in units of the given sigmas, the medians of what they may be.
+
+        With them the fleet's `likely` one, anew, and the mean of each journey's over its median.
+        """
         config, strength = self.config, self.config.scale_strength
         weight = (count > 0) / variance
         of_common = weight / weight.sum(0).clamp_min(1e-300)
@@ -207,7 +230,10 @@ class PosePrior:
         likely = torch.where(total > 0, likely.clamp(*_SCALES_SQUARED), 1.0)
         fleet = likely ** (total / (total + config.scale_trust))
         own = (centre * fleet + found) / (centre + freedom)
-        return own.clamp(*_SCALES_SQUARED), likely
+        wider = _mean_over_median(strength + freedom) * _mean_over_median(
+            total + config.scale_trust
+        )
+        return own.clamp(*_SCALES_SQUARED), likely, wider
 
     def _share_of_mean(self) -> Float[Tensor, "j 3"]:
         """Variance of a drift's mean over its journey's way, in units of the drift's."""
@@ -227,6 +253,12 @@ class PosePrior:
             self.bias_sigma * torch.cat((bias, turns), dim=1),
             self.drift_sigma * torch.cat((moves, turns), dim=1),
         )
+
+
+def _mean_over_median(freedom: Tensor) -> Tensor:
+    """Of an inverse chi-squared variance; that of three degrees of freedom where there are fewer."""
+    freedom = freedom.clamp_min(3)
+    return (freedom - 2 / 3) / (freedom - 2)
 
 
 _SWEEPS = 60

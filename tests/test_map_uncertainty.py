@@ -41,7 +41,10 @@ def found(bundle: Bundle, tiny_result: MapResult) -> MapUncertainty:
 def dense(bundle: Bundle):
     """Joint covariance of all unknowns, and the columns of each variable's blocks."""
     with torch.no_grad():
-        normal = DenseBackend().assemble(bundle.problem(held=False), bundle.values())
+        values = bundle.values()
+        scale = bundle.prior.expected_scale(values["drift"], bundle.prior_scale)
+        problem = bundle.problem(held=False, prior_scale=scale)
+        normal = DenseBackend().assemble(problem, values)
         covariance = normal.covariance(floor=1e-9)[0]
 
     def columns(name: str) -> Tensor:

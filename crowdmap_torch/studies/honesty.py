@@ -29,15 +29,16 @@ def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """Coverage over all data sets, and the shared part's normalised squared error."""
     found = results(_maps(settings.scale), folder)
-    signs, coverage, nees, shared, lanes, length = (
-        numbers(found, f"map.{path}")
+    signs, coverage, nees, shared, drawn, lanes, length = (
+        numbers(found, path)
         for path in (
-            "uncertainty.signs",
-            "uncertainty.coverage",
-            "uncertainty.mean_nees",
-            "uncertainty.shared_nees",
-            "lanes.sigma_coverage",
-            "lanes.seen_length_m",
+            "map.uncertainty.signs",
+            "map.uncertainty.coverage",
+            "map.uncertainty.mean_nees",
+            "map.uncertainty.shared_nees",
+            "drawn_shift_nees",
+            "map.lanes.sigma_coverage",
+            "map.lanes.seen_length_m",
         )
     )
     sets = len(found)
@@ -53,12 +54,17 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             _weighted(shared, [1.0] * sets),
             f"{low:.2f} to {high:.2f}",
         ),
+        (
+            "of the draw: mean pose errors against their true sigmas",
+            _weighted(drawn, [1.0] * sets),
+            "",
+        ),
         ("lane points inside 1.96 sigma [%]", 100 * _weighted(lanes, length), asked),
     )
     of_sets = tuple(
-        (number, int(n), 100 * c, e, s, 100 * line)
-        for number, (n, c, e, s, line) in enumerate(
-            zip(signs, coverage, nees, shared, lanes, strict=True)
+        (number, int(n), 100 * c, e, s, d, 100 * line)
+        for number, (n, c, e, s, d, line) in enumerate(
+            zip(signs, coverage, nees, shared, drawn, lanes, strict=True)
         )
     )
     seeds = list(range(sets))
@@ -70,6 +76,7 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         Panel("normalised squared error", [
             Line("sign centres, mean", seeds, nees),
             Line("shared part", seeds, shared),
+            Line("the draw", seeds, drawn),
         ]),
     ]  # fmt: skip
     scale = settings.scale
@@ -80,13 +87,23 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             f"{sets} data sets of {scale.honest_journeys} journeys on {scale.short_road.length_m:.0f} m of road. The mean "
             "shift of all signs is the part that all journeys share; what is left is compared with the covariances "
             "without that part. Within one data set errors go together, as they come from the slow drift of a few "
-            "journeys: it has few independent errors, however many signs stand there, and single sets scatter widely.",
+            "journeys: it has few independent errors, however many signs stand there, and single sets scatter widely. "
+            "The draw: the mean of the poses' true errors against the sigmas that they were drawn from, which is what the "
+            "shared part's error comes to for one who knows everything but that mean.",
         ),
         tables=(
             Table("honesty", ("", "found", "asked"), rows),
             Table(
                 "honesty-sets",
-                ("seed", "signs", "inside [%]", "mean NEES", "shared NEES", "lanes inside [%]"),
+                (
+                    "seed",
+                    "signs",
+                    "inside [%]",
+                    "mean NEES",
+                    "shared NEES",
+                    "the draw's",
+                    "lanes inside [%]",
+                ),
                 of_sets,
             ),
         ),

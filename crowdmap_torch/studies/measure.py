@@ -34,6 +34,7 @@ from crowdmap_torch.mapper import (
     finish_map,
     first_map,
 )
+from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.stages import adjust
 from crowdmap_torch.stages.cluster import sign_heads
 from crowdmap_torch.tables import Association, Dataset, HdMap, Survey, concatenate
@@ -131,6 +132,27 @@ def observable_rows(drives: Drives) -> Bool[Tensor, " n"]:
     for truth in drives.truth.journeys:
         seen += frames_of_signs(truth, len(signs)) >= MIN_FRAMES
     return seen >= min(MIN_JOURNEYS, len(drives.truth.journeys))
+
+
+def drawn_shift_nees(drives: Drives, positioning: PositioningConfig) -> float:
+    """Normalised squared error of the mean of all poses' errors, against the sigmas that they were drawn from.
+
+    What a map that knew these errors exactly, but for their mean, would have for its `shared_nees`: how far out the draw
+    itself is.
+    """
+    journeys = drives.truth.journeys
+    shift, variance = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    bias = (positioning.bias_e_m, positioning.bias_n_m, positioning.bias_u_m)
+    for truth in journeys:
+        p = truth.T_world_camera[:, :3, 3]
+        error = truth.journey.T_world_camera[:, :3, 3] - p
+        step = (p[1:] - p[:-1]).norm(dim=1)
+        shift += (step[:, None] * error[1:]).sum(0) / step.sum()
+        stretch = step.sum() / positioning.drift_length_m
+        # Of an Ornstein-Uhlenbeck process, the variance of its mean over a stretch.
+        slow = 2 / stretch * (1 + torch.expm1(-stretch) / stretch)
+        variance += shift.new_tensor(bias).square() + positioning.drift_m**2 * slow
+    return float((shift.square() / variance).sum())
 
 
 def averaged_signs(

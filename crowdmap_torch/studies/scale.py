@@ -46,7 +46,7 @@ class Scale:
     """On the short road."""
     honest_journeys: int = 10
     """Journeys on the short road whose map's covariances are judged."""
-    honest_sets: int = 20
+    honest_sets: int = 60
     """Data sets of them."""
     linear_sets: int = 8
     """Those of them that the linear estimator is given too."""

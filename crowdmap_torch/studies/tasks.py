@@ -22,7 +22,12 @@ from crowdmap_torch.mapper import JourneyMap, build_map, certain_part, map_journ
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.simulate import SimulationConfig, write_dataset
 from crowdmap_torch.studies.folder import StudyFolder, dataset_name, digest, journey_config_hash
-from crowdmap_torch.studies.measure import load_drives, measure_journey, measure_map
+from crowdmap_torch.studies.measure import (
+    drawn_shift_nees,
+    load_drives,
+    measure_journey,
+    measure_map,
+)
 
 _STAGE = "studies, seconds of work"
 
@@ -179,6 +184,7 @@ class MeasureMap:
         measured = measure_map(
             drives, maps, self.config, adjusted=self.adjusted, control=self.control
         )
+        measured["drawn_shift_nees"] = drawn_shift_nees(drives, self.simulation.positioning)
         folder.write_result(self.key, measured)
 
 
