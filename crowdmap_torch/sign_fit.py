@@ -71,7 +71,7 @@ class SignFitConfig:
     """What the car's course says of it."""
     tukey: float = 2.8
     """Detections with a root mean square whitened error beyond this many standard deviations have no say."""
-    tukey_alone: float = 10.0
+    tukey_alone: float = 20.0
     """The same of signs fitted one by one, whose residuals hold the errors of the poses too: those move the nearest views
     most, which tell most."""
     habit: SignHabit = field(default_factory=SignHabit)

@@ -57,7 +57,7 @@ class SignTriangulationConfig:
     """Tracklets with fewer detections of the tracklet's shape are pruned."""
     min_parallax_deg: float = 0.7
     """`joint`: tracklets whose rays differ by less are pruned."""
-    min_parallax_alone_deg: float = 8.0
+    min_parallax_alone_deg: float = 10.0
     """`paper2017`: the same of signs fitted one by one, which what drifts between the views moves the further the less their
     rays differ."""
     max_distance_m: float = 80.0
