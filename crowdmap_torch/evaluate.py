@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -45,7 +45,6 @@ from crowdmap_torch.tables import HdMap, Lanes, Origin, Signs, Survey
 
 __all__ = [
     "MapFigures",
-    "compare_map_signs",
     "control_ids_of",
     "evaluate_lanes",
     "evaluate_map",
@@ -78,10 +77,14 @@ class MapFigures:
     gate_m: float = 3.0
     notes: tuple[str, ...] = field(default_factory=tuple)
     """What could not be evaluated, and why."""
+    comparison: SignComparison | None = field(default=None, repr=False)
+    """Each matched sign of the map beside its surveyed one: what the figures of signs are taken from."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Nested dicts of numbers; null for what is unknown, ready for JSON."""
-        return plain(self)
+        """Nested dicts of numbers, without the comparison; null for what is unknown, ready for JSON."""
+        figures = plain(replace(self, comparison=None))
+        del figures["comparison"]
+        return figures
 
 
 def evaluate_map(
@@ -132,21 +135,8 @@ def evaluate_map(
         control_signs=int(comparison.control.sum()),
         gate_m=gate_m,
         notes=notes,
+        comparison=comparison,
     )
-
-
-def compare_map_signs(
-    hd_map: HdMap,
-    survey: Survey,
-    *,
-    truth: Truth | None = None,
-    control_ids: Collection[str] = (),
-    observable_ids: Collection[str] | None = None,
-    gate_m: float = 3.0,
-) -> SignComparison:
-    """Each matched sign of a map beside its surveyed one, as `evaluate_map` sees them."""
-    config = SignEvaluationConfig(match=SignMatchConfig(gate_m=gate_m))
-    return _compare(hd_map.signs, survey, truth, control_ids, observable_ids, config)
 
 
 def control_ids_of(control: Survey, survey: Survey) -> tuple[str, ...]:

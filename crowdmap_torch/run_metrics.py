@@ -7,8 +7,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from crowdmap_torch.config import MapperConfig, dump
-from crowdmap_torch.evaluate import MapFigures, compare_map_signs
+from crowdmap_torch.evaluate import MapFigures
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult, certain_part
 from crowdmap_torch.observations import station
 from crowdmap_torch.report.record import Iteration, JourneySummary, Pruned, RunRecord, Spectrum
@@ -70,17 +71,24 @@ def pruned_of(dataset: Dataset, result: MapResult) -> tuple[Pruned, ...]:
     return tuple(Pruned(stage, why, count) for (stage, why), count in totals.items() if count)
 
 
-def journey_summaries(dataset: Dataset, result: MapResult) -> tuple[JourneySummary, ...]:
+def journey_summaries(
+    dataset: Dataset, result: MapResult, truth: Truth | None = None
+) -> tuple[JourneySummary, ...]:
     """One line for each journey in use."""
     summaries = []
+    true: Sequence[tuple[float, float, float] | None] = [None] * len(dataset.journeys)
+    if truth is not None:
+        # A bias is what is to be added to the given positions.
+        true = [(-x, -y, -z) for x, y, z in (t.mean_error_m.tolist() for t in truth.journeys)]
     found = result.uncertainty
     sigmas = found.bias_covariance.diagonal(dim1=1, dim2=2).sqrt()
-    for journey, made, association, bias, sigma in zip(
+    for journey, made, association, bias, sigma, true_bias in zip(
         dataset.journeys,
         result.journey_maps,
         result.associations,
         found.bias.tolist(),
         sigmas.tolist(),
+        true,
         strict=True,
     ):
         east, north, up, heading = bias
@@ -95,6 +103,7 @@ def journey_summaries(dataset: Dataset, result: MapResult) -> tuple[JourneySumma
                 bias_sigma=(sigma[0], sigma[1], sigma[2]),
                 heading_deg=math.degrees(heading),
                 heading_sigma_deg=math.degrees(sigma[3]),
+                true_bias=true_bias,
             )
         )
     return tuple(summaries)
@@ -176,6 +185,7 @@ def record_of(
     watch: Watch,
     seconds: Mapping[str, float],
     survey: Survey | None,
+    truth: Truth | None,
     figures: MapFigures | None,
     figures_before: MapFigures | None,
 ) -> RunRecord:
@@ -190,13 +200,11 @@ def record_of(
         survey=survey,
         figures=figures,
         figures_before=figures_before,
-        comparison=None if survey is None else compare_map_signs(hd_map, survey),
-        comparison_before=None if survey is None else compare_map_signs(before, survey),
         paths_world={
             journey.journey_id: poses[:, :3, 3]
             for journey, poses in zip(dataset.journeys, result.poses, strict=True)
         },
-        journeys=journey_summaries(dataset, result),
+        journeys=journey_summaries(dataset, result, truth),
         counts=counts_of(dataset, result, config),
         pruned=pruned_of(dataset, result),
         rejected=dataset.rejected,

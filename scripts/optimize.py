@@ -116,7 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
     progress.finish()
     seconds, compared = progress.seconds, (figures, figures_before)
     run.write_metrics(metrics_of(dataset, result, config, watch.iterations, seconds, *compared))
-    record = record_of(dataset, result, config, watch, seconds, survey, *compared)
+    record = record_of(dataset, result, config, watch, seconds, survey, truth, *compared)
     write_report(run.report, record)
     print(f"map: {run.map}")
     print(f"report: {run.report}")

@@ -45,6 +45,21 @@ class JourneyTruth:
         """What takes the error of a frame's pose off a world point."""
         return self.T_world_camera @ se3.inverse(self.journey.T_world_camera)
 
+    @property
+    def way_m(self) -> Float[Tensor, " s"]:
+        """How far the camera really moved between successive frames."""
+        p = self.T_world_camera[:, :3, 3]
+        return (p[1:] - p[:-1]).norm(dim=1)
+
+    @property
+    def mean_error_m(self) -> Float[Tensor, " 3"]:
+        """Given minus true positions, the mean along the way; at a standstill, over the frames."""
+        error = self.journey.T_world_camera[:, :3, 3] - self.T_world_camera[:, :3, 3]
+        way = self.way_m[:, None]
+        # Half a step belongs to either of its ends.
+        weight = torch.cat((way, way[:1] * 0)) + torch.cat((way[:1] * 0, way)) + 1e-9
+        return (weight * error).sum(0) / weight.sum()
+
 
 @dataclass(frozen=True)
 class Truth:

@@ -107,7 +107,10 @@ def _journeys(record: RunRecord) -> str:
     if not record.journeys:
         return warning
     return (
-        note("Bias: what the positioning module got wrong, in the mean over the journey.")
+        note(
+            "Bias: what is to be added to the positions as given, in the mean over the journey. What all journeys have "
+            "wrong alike is in none of them."
+        )
         + drawing(plots.plot_bias(record.journeys))
         + bias_table(record.journeys)
         + warning

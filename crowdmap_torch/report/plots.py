@@ -149,7 +149,7 @@ def plot_bias(journeys: Sequence[JourneySummary]) -> Figure:
     plan.set(xlabel="east [m]", ylabel="north [m]", title="bias of each journey")
     number = np.arange(len(journeys))
     height.bar(number, bias[:, 2], color=MAP, width=0.6, label="estimated")
-    height.plot(number[known], true[:, 2], "o", mfc="none", mec=SURVEY, ms=6, label="true")
+    height.plot(number[known], true[:, 2], "o", mfc="white", mec=SURVEY, ms=6, label="true")
     height.axhline(0, color=FAINT, lw=0.8)
     height.set(xlabel="journey", ylabel="up [m]", title="its vertical part")
     if known:

@@ -89,10 +89,6 @@ class RunRecord:
     survey: Survey | None = None
     figures: MapFigures | None = None
     figures_before: MapFigures | None = None
-    comparison: SignComparison | None = None
-    """Of `hd_map` and the survey (`evaluate.compare_map_signs`)."""
-    comparison_before: SignComparison | None = None
-    """Of `map_before`."""
     paths_world: Mapping[str, Float[Tensor, "f 3"]] = field(default_factory=dict)
     """Where the cars drove, by journey."""
     journeys: tuple[JourneySummary, ...] = ()
@@ -112,3 +108,13 @@ class RunRecord:
     timings_s: Mapping[str, float] = field(default_factory=dict)
     """By stage, in the order of the stages."""
     config_yaml: str = ""
+
+    @property
+    def comparison(self) -> SignComparison | None:
+        """Of the map's signs with the survey."""
+        return None if self.figures is None else self.figures.comparison
+
+    @property
+    def comparison_before(self) -> SignComparison | None:
+        """Of the cluster heads."""
+        return None if self.figures_before is None else self.figures_before.comparison

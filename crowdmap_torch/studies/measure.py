@@ -144,11 +144,8 @@ def drawn_shift_nees(drives: Drives, positioning: PositioningConfig) -> float:
     shift, variance = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     bias = (positioning.bias_e_m, positioning.bias_n_m, positioning.bias_u_m)
     for truth in journeys:
-        p = truth.T_world_camera[:, :3, 3]
-        error = truth.journey.T_world_camera[:, :3, 3] - p
-        step = (p[1:] - p[:-1]).norm(dim=1)
-        shift += (step[:, None] * error[1:]).sum(0) / step.sum()
-        stretch = step.sum() / positioning.drift_length_m
+        shift += truth.mean_error_m
+        stretch = truth.way_m.sum() / positioning.drift_length_m
         # Of an Ornstein-Uhlenbeck process, the variance of its mean over a stretch.
         slow = 2 / stretch * (1 + torch.expm1(-stretch) / stretch)
         variance += shift.new_tensor(bias).square() + positioning.drift_m**2 * slow

@@ -4,7 +4,7 @@ import pytest
 import torch
 from small_world import Builder
 
-from crowdmap_torch.evaluate import compare_map_signs, evaluate_map
+from crowdmap_torch.evaluate import evaluate_map
 from crowdmap_torch.report.record import (
     Iteration,
     JourneySummary,
@@ -56,8 +56,6 @@ def record(build: Builder) -> RunRecord:
         survey=survey,
         figures=evaluate_map(hd_map, survey),
         figures_before=evaluate_map(before, survey),
-        comparison=compare_map_signs(hd_map, survey),
-        comparison_before=compare_map_signs(before, survey),
         paths_world={"a": build.straight(1.5), "b": build.straight(1.8)},
         journeys=(
             JourneySummary(

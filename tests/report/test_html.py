@@ -104,7 +104,7 @@ def test_an_empty_map_has_a_report(build, record):
 def test_signs_beside_the_survey_say_what_they_are(build, record):
     table = sign_table(record)
     assert table.count("tag matched") == 9
-    assert sign_table(replace(record, comparison=None)).count('class="tag') == 0
+    assert sign_table(replace(record, figures=None)).count('class="tag') == 0
 
 
 def test_the_same_run_gives_the_same_report(record: RunRecord):
