@@ -230,9 +230,7 @@ class PosePrior:
         likely = torch.where(total > 0, likely.clamp(*_SCALES_SQUARED), 1.0)
         fleet = likely ** (total / (total + config.scale_trust))
         own = (centre * fleet + found) / (centre + freedom)
-        wider = _mean_over_median(strength + freedom) * _mean_over_median(
-            total + config.scale_trust
-        )
+        wider = _mean_over_median(strength, freedom) * _mean_over_median(config.scale_trust, total)
         return own.clamp(*_SCALES_SQUARED), likely, wider
 
     def _share_of_mean(self) -> Float[Tensor, "j 3"]:
@@ -255,10 +253,10 @@ class PosePrior:
         )
 
 
-def _mean_over_median(freedom: Tensor) -> Tensor:
-    """Of an inverse chi-squared variance; that of three degrees of freedom where there are fewer."""
-    freedom = freedom.clamp_min(3)
-    return (freedom - 2 / 3) / (freedom - 2)
+def _mean_over_median(given: float, found: Tensor) -> Tensor:
+    """Of an inverse chi-squared variance with so many degrees of freedom; 1 where none were found: it is as given."""
+    freedom = (given + found).clamp_min(3)
+    return torch.where(found > 0, (freedom - 2 / 3) / (freedom - 2), 1.0)
 
 
 _SWEEPS = 60

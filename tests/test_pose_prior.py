@@ -143,9 +143,8 @@ def test_a_single_journey_says_nothing_of_its_sigmas():
     prior = make_prior(1)
     scale = torch.full((1, 3), 3.0, dtype=F64)
     drift = drawn(prior, scale, seed=0) + 1.0
-    torch.testing.assert_close(
-        prior.rescaled(drift, torch.ones_like(scale)), torch.ones_like(scale)
-    )
+    for found in (prior.rescaled, prior.expected_scale):
+        torch.testing.assert_close(found(drift, torch.ones_like(scale)), torch.ones_like(scale))
 
 
 @pytest.mark.parametrize("journeys", [2, 10])
