@@ -29,14 +29,15 @@ def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """Coverage over all data sets, and the shared part's normalised squared error."""
     found = results(_maps(settings.scale), folder)
-    signs, coverage, nees, shared, drawn, lanes, length = (
+    signs, coverage, nees, shared, drawn, expected, lanes, length = (
         numbers(found, path)
         for path in (
             "map.uncertainty.signs",
             "map.uncertainty.coverage",
             "map.uncertainty.mean_nees",
             "map.uncertainty.shared_nees",
-            "drawn_shift_nees",
+            "shared.drawn_nees",
+            "shared.expected_nees",
             "map.lanes.sigma_coverage",
             "map.lanes.seen_length_m",
         )
@@ -55,9 +56,14 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             f"{low:.2f} to {high:.2f}",
         ),
         (
-            "of the draw: mean pose errors against their true sigmas",
+            "the same of the draw: mean pose errors against their true sigmas",
             _weighted(drawn, [1.0] * sets),
             "",
+        ),
+        (
+            "the shared part's, in the mean over all draws by those sigmas",
+            _weighted(expected, [1.0] * sets),
+            f"{_CENTER_FREEDOM}",
         ),
         ("lane points inside 1.96 sigma [%]", 100 * _weighted(lanes, length), asked),
     )

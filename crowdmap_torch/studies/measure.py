@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.benchmark.association import sign_associations
@@ -122,6 +122,7 @@ def measure_map(
     final = certain_part(result.hd_map, config.min_confidence)
     measured["map"] = _figures(drives, final, result.associations, names)
     measured["control_points"] = result.control_points
+    measured["shared_covariance"] = final.shared_covariance.tolist()
     return measured
 
 
@@ -134,22 +135,31 @@ def observable_rows(drives: Drives) -> Bool[Tensor, " n"]:
     return seen >= min(MIN_JOURNEYS, len(drives.truth.journeys))
 
 
-def drawn_shift_nees(drives: Drives, positioning: PositioningConfig) -> float:
-    """Normalised squared error of the mean of all poses' errors, against the sigmas that they were drawn from.
+def shared_part(
+    drives: Drives, positioning: PositioningConfig, covariance: Float[Tensor, "3 3"]
+) -> dict[str, float]:
+    """How far out the draw of the mean of all poses' errors is, and how large that mean is beside a map's `covariance`.
 
-    What a map that knew these errors exactly, but for their mean, would have for its `shared_nees`: how far out the draw
-    itself is.
+    `drawn_nees`: its normalised squared error against the sigmas that it was drawn from, which is what the map's
+    `shared_nees` comes to for one who knows everything but this mean. `expected_nees`: the mean of `shared_nees` over
+    all draws by those sigmas, with the `covariance` that the map states; 3 is right. The scales of the sigmas are found
+    from what differs between journeys, which says nothing of their mean: so the draw has no part in it.
     """
     journeys = drives.truth.journeys
     shift, variance = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     bias = (positioning.bias_e_m, positioning.bias_n_m, positioning.bias_u_m)
     for truth in journeys:
-        shift += truth.mean_error_m
+        shift += truth.mean_error_m / len(journeys)
         stretch = truth.way_m.sum() / positioning.drift_length_m
         # Of an Ornstein-Uhlenbeck process, the variance of its mean over a stretch.
         slow = 2 / stretch * (1 + torch.expm1(-stretch) / stretch)
-        variance += shift.new_tensor(bias).square() + positioning.drift_m**2 * slow
-    return float((shift.square() / variance).sum())
+        own = shift.new_tensor(bias).square() + positioning.drift_m**2 * slow
+        variance += own / len(journeys) ** 2
+    expected = torch.linalg.solve(covariance, torch.diag(variance)).trace()
+    return {
+        "drawn_nees": float((shift.square() / variance).sum()),
+        "expected_nees": float(expected),
+    }
 
 
 def averaged_signs(

@@ -23,10 +23,10 @@ from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.simulate import SimulationConfig, write_dataset
 from crowdmap_torch.studies.folder import StudyFolder, dataset_name, digest, journey_config_hash
 from crowdmap_torch.studies.measure import (
-    drawn_shift_nees,
     load_drives,
     measure_journey,
     measure_map,
+    shared_part,
 )
 
 _STAGE = "studies, seconds of work"
@@ -184,7 +184,9 @@ class MeasureMap:
         measured = measure_map(
             drives, maps, self.config, adjusted=self.adjusted, control=self.control
         )
-        measured["drawn_shift_nees"] = drawn_shift_nees(drives, self.simulation.positioning)
+        if self.adjusted:
+            stated = torch.tensor(measured["shared_covariance"], dtype=torch.float64)
+            measured["shared"] = shared_part(drives, self.simulation.positioning, stated)
         folder.write_result(self.key, measured)
 
 

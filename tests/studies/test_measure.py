@@ -10,6 +10,7 @@ from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.evaluate import evaluate_map
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult, certain_part
+from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.studies.measure import (
     Drives,
     averaged_signs,
@@ -17,6 +18,7 @@ from crowdmap_torch.studies.measure import (
     measure_journey,
     measure_map,
     observable_rows,
+    shared_part,
     spread_signs,
     true_signs,
 )
@@ -106,3 +108,17 @@ def test_spread_signs_are_far_from_each_other(tiny_survey: Survey):
     every = spread_signs(tiny_survey, among, 1000)
     assert sorted(every.tolist()) == torch.nonzero(among)[:, 0].tolist()
     assert len(spread_signs(tiny_survey, among, 0)) == 0
+
+
+def test_what_all_share_is_judged_by_the_sigmas_it_was_drawn_from(drives: Drives):
+    """Three journeys of 120 m: 0.78 of the variance of a drift that forgets itself over 150 m stay in its mean."""
+    exact = torch.diag(torch.tensor([0.139, 0.139, 0.225], dtype=torch.float64)) / 3
+    found = shared_part(drives, PositioningConfig(), exact)
+    assert found["expected_nees"] == pytest.approx(3.0, rel=0.05)
+    assert shared_part(drives, PositioningConfig(), 2 * exact)["expected_nees"] == pytest.approx(
+        found["expected_nees"] / 2
+    )
+    error = torch.stack([t.mean_error_m for t in drives.truth.journeys]).mean(0)
+    assert found["drawn_nees"] == pytest.approx(
+        float((error.square() / exact.diagonal()).sum()), rel=0.1
+    )
