@@ -240,7 +240,7 @@ class PosePrior:
         first = first.scatter_reduce(0, own, self.nodes.way, "amin")
         last = torch.zeros_like(first).scatter_reduce(0, own, self.nodes.way, "amax")
         ratio = ((last - first).clamp_min(1.0)[:, None] / self.length_m[:, :3]).nan_to_num(1.0)
-        return 2 / ratio * (1 + torch.expm1(-ratio) / ratio)
+        return variance_of_mean(ratio)
 
     def _scaled(
         self, scale: Float[Tensor, "j 3"]
@@ -251,6 +251,11 @@ class PosePrior:
             self.bias_sigma * torch.cat((bias, turns), dim=1),
             self.drift_sigma * torch.cat((moves, turns), dim=1),
         )
+
+
+def variance_of_mean(ratio: Tensor) -> Tensor:
+    """Of a Gauss-Markov chain's mean over a way `ratio` times its correlation length, in units of the chain's variance."""
+    return 2 / ratio * (1 + torch.expm1(-ratio) / ratio)
 
 
 def _mean_over_median(given: float, found: Tensor) -> Tensor:

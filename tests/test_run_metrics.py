@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -35,3 +37,16 @@ def test_the_report_shows_the_signs_that_the_figures_count(
     errors = sign_errors(figures.comparison, "absolute")
     assert len(errors) == figures.signs.matched_observable < len(tiny_survey.sign_id)
     assert float(errors.mean()) == pytest.approx(figures.signs.absolute.total.mean, rel=0.1)
+
+
+def test_the_mean_error_of_a_car_that_stands_is_that_of_its_frames(tiny_truth: Truth):
+    truth = tiny_truth.journeys[0]
+    given = truth.journey.T_world_camera
+    for frames in (1, 5):
+        first = torch.zeros(frames, dtype=torch.int64)
+        journey = replace(truth.journey, T_world_camera=given[:frames])
+        stands = replace(truth, journey=journey, T_world_camera=truth.T_world_camera[first])
+        expected = (given[:frames, :3, 3] - truth.T_world_camera[0, :3, 3]).mean(0)
+        assert torch.allclose(stands.mean_error_m, expected, atol=0.02)
+    apart = given[:, :3, 3] - truth.T_world_camera[:, :3, 3]
+    assert torch.allclose(truth.mean_error_m, apart.mean(0), atol=0.1)

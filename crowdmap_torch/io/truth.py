@@ -55,10 +55,10 @@ class JourneyTruth:
     def mean_error_m(self) -> Float[Tensor, " 3"]:
         """Given minus true positions, the mean along the way; at a standstill, over the frames."""
         error = self.journey.T_world_camera[:, :3, 3] - self.T_world_camera[:, :3, 3]
-        way = self.way_m[:, None]
+        pad = torch.nn.functional.pad
         # Half a step belongs to either of its ends.
-        weight = torch.cat((way, way[:1] * 0)) + torch.cat((way[:1] * 0, way)) + 1e-9
-        return (weight * error).sum(0) / weight.sum()
+        weight = pad(self.way_m, (0, 1)) + pad(self.way_m, (1, 0)) + 1e-9
+        return weight @ error / weight.sum()
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,8 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             "without that part. Within one data set errors go together, as they come from the slow drift of a few "
             "journeys: it has few independent errors, however many signs stand there, and single sets scatter widely. "
             "The draw: the mean of the poses' true errors against the sigmas that they were drawn from, which is what the "
-            "shared part's error comes to for one who knows everything but that mean.",
+            "shared part's error comes to for one who knows everything but that mean. Over all draws: what the maps state "
+            "of the shared part beside those sigmas, whatever was drawn.",
         ),
         tables=(
             Table("honesty", ("", "found", "asked"), rows),

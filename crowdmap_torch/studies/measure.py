@@ -34,6 +34,7 @@ from crowdmap_torch.mapper import (
     finish_map,
     first_map,
 )
+from crowdmap_torch.pose_prior import variance_of_mean
 from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.stages import adjust
 from crowdmap_torch.stages.cluster import sign_heads
@@ -150,9 +151,7 @@ def shared_part(
     bias = (positioning.bias_e_m, positioning.bias_n_m, positioning.bias_u_m)
     for truth in journeys:
         shift += truth.mean_error_m / len(journeys)
-        stretch = truth.way_m.sum() / positioning.drift_length_m
-        # Of an Ornstein-Uhlenbeck process, the variance of its mean over a stretch.
-        slow = 2 / stretch * (1 + torch.expm1(-stretch) / stretch)
+        slow = variance_of_mean(truth.way_m.sum() / positioning.drift_length_m)
         own = shift.new_tensor(bias).square() + positioning.drift_m**2 * slow
         variance += own / len(journeys) ** 2
     expected = torch.linalg.solve(covariance, torch.diag(variance)).trace()
