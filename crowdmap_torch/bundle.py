@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from crowdmap_torch import residual_blocks, residuals
 from crowdmap_torch.geometry import spline_basis
+from crowdmap_torch.innovation import innovations
 from crowdmap_torch.lane_matching import LaneMatches, follow
 from crowdmap_torch.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.optim import levenberg_marquardt as lm
@@ -18,11 +19,17 @@ from crowdmap_torch.optim.chain import ChainBackend
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
 from crowdmap_torch.optim.matrix_free import MatrixFreeBackend
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable
-from crowdmap_torch.optim.robust import Tukey, median_scale
+from crowdmap_torch.optim.robust import JointTukey, Tukey, median_scale
 from crowdmap_torch.pixel_noise import noise_by_box, shared_error
 from crowdmap_torch.pose_prior import PosePrior, PosePriorConfig
 from crowdmap_torch.sign_habit import SignHabit
 
+_PIXEL_DIM = 2
+"""Numbers of a corner's residual: u and v."""
+_FIRST_REACH = 2.0
+"""Factor by which the bound on a detection's error is wider until detections are judged: a wrong start gives up few."""
+_MOST_JUDGEMENTS = 2
+"""Detections are judged no more often than this, should some of them come and go."""
 _NARROWS = 0.97
 """A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
 _SCALE_RESTS = 0.005
@@ -42,7 +49,8 @@ class AdjustConfig:
     prior: PosePriorConfig = field(default_factory=PosePriorConfig)
     """What the poses may be wrong by."""
     tukey_c: float = 4.685
-    """Residuals beyond this many standard deviations have no weight."""
+    """Residuals beyond this many standard deviations have no weight; the corners of a detection are judged together, by a
+    bound that is as efficient."""
     sign_sigma_px: float = 0.5
     """Least standard deviation of a sign corner of a large box; more where the residuals say so."""
     box_sigma: float = 0.5
@@ -54,6 +62,9 @@ class AdjustConfig:
     are what the images say."""
     size_class_sigma: float = 0.005
     """1-sigma of the width and height of signs about their class, as a share."""
+    innovation_chance: float = 1e-5
+    """Detections further from what everything else foresees than normal noise brings them with this chance are given up;
+    0: none."""
     lane_sigma_px: float = 0.8
     """Least standard deviation of a lane point across the marker."""
     lane_correlation: float = 1.0
@@ -86,10 +97,14 @@ class AdjustConfig:
     """Samples of the map that such covariances are estimated from; their sigmas are then good to 9 %."""
 
     def __post_init__(self) -> None:
-        """Refuses size classes that no sign can have."""
+        """Refuses size classes that no sign can have, and a chance that is none."""
         if any(side <= 0 for sides in self.size_classes_m for side in sides):
             raise ValueError(
                 f"size_classes_m: expected positive widths and heights in metres, found {self.size_classes_m}"
+            )
+        if not 0 <= self.innovation_chance < 1:
+            raise ValueError(
+                f"innovation_chance: expected a chance from 0 to less than 1, found {self.innovation_chance}"
             )
         if self.size_class_sigma <= 0:
             raise ValueError(
@@ -112,6 +127,10 @@ class Bundle(nn.Module):
     that of lane points, as those of one detection err together."""
     small_box: Tensor
     """Box [px] at which a corner's standard deviation is 1.41 times that of a large box."""
+    judged: Tensor
+    """How often detections were judged by everything else."""
+    given_up: Tensor
+    """Detections, by number, that have no say."""
     prior_scale: Tensor
     """By journey, how far bias, drift and rotation are from the sigmas of `prior`."""
 
@@ -138,6 +157,10 @@ class Bundle(nn.Module):
             self.register_parameter(f"delta_{name}", nn.Parameter(increment))
         self.register_buffer("scale", torch.full((3,), torch.inf, dtype=values["pose"].dtype))
         self.register_buffer("small_box", torch.zeros_like(self.scale[0]))
+        last = int(corners.detection.max()) + 1 if len(corners) else 0
+        given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
+        self.register_buffer("given_up", given_up)
+        self.register_buffer("judged", torch.zeros_like(given_up, dtype=torch.long).sum())
         self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
         self.fixed = fixed
         self.corners = corners
@@ -219,6 +242,29 @@ class Bundle(nn.Module):
         self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))
         return at_rest and not bool(moved.any())
 
+    @torch.no_grad()
+    def judge(self, backend: BorderedBackend | MatrixFreeBackend) -> bool:
+        """Gives detections up that everything else is too much against, at the minimum; returns whether any changed.
+
+        What they are judged by is their innovation: of the nearest view of a sign the residual says little, as the pose
+        goes where that view wants it. From the first time on the bound on residuals is as narrow as it is to be.
+        """
+        if int(self.judged) >= _MOST_JUDGEMENTS:
+            return False
+        values, given_up = self.values(), torch.zeros_like(self.given_up)
+        judged = self._corner_term(self.corner_sigma()) if self.config.innovation_chance else {}
+        for term in judged.values():
+            inner = backend.assemble(self.problem(), values).inner
+            of_pose = inner.unstack(inner.block_covariances())["pose"]
+            found = innovations(term, self.variables, values, of_pose, row_dim=_PIXEL_DIM)
+            assert isinstance(term.loss, JointTukey)
+            too_large = found.are_too_large(self.config.innovation_chance)
+            given_up[self.corners.detection] = too_large[term.loss.run]
+        first, changed = int(self.judged) == 0, not torch.equal(given_up, self.given_up)
+        self.judged += 1
+        self.given_up.copy_(given_up)
+        return first or changed
+
     def _narrow(self, values: dict[str, Tensor]) -> bool:
         """Narrows the scales of pixels to what the residuals show; returns whether they have come to rest."""
         config = self.config
@@ -262,21 +308,32 @@ class Bundle(nn.Module):
             jacobian=residuals.lane_slide_jacobian,
         )
 
-    def problem(
-        self, *, held: bool = True, prior_scale: Float[Tensor, "j 3"] | None = None
-    ) -> Problem:
-        """The least-squares problem with the matches and scales of the moment; lanes `held` where they are, or not.
-
-        `prior_scale` stands for the bundle's own where it is given.
-        """
-        scale = self.prior_scale if prior_scale is None else prior_scale
-        terms = {**self.prior.terms(scale), **self.fixed}
-        if held and self.held is not None:
+    def problem(self) -> Problem:
+        """The least-squares problem with the matches and scales of the moment, lanes held where they are."""
+        terms = self._terms(self.prior_scale)
+        if self.held is not None:
             terms["lane_slide"] = self.held
+        return Problem(self.variables, terms)
+
+    def information(self, prior_scale: Float[Tensor, "j 3"]) -> Problem:
+        """The problem whose Hessian tells what is known: nothing held, `prior_scale` for that of the bundle.
+
+        The weights of detections are raised to what they keep of the information.
+        """
+        terms = {
+            name: replace(term, loss=term.loss.informative(row_dim=_PIXEL_DIM))
+            if isinstance(term.loss, JointTukey)
+            else term
+            for name, term in self._terms(prior_scale).items()
+        }
+        return Problem(self.variables, terms)
+
+    def _terms(self, prior_scale: Float[Tensor, "j 3"]) -> dict[str, CostTerm]:
+        terms = {**self.prior.terms(prior_scale), **self.fixed}
         terms.update(self._size_term())
         terms.update(self._corner_term(self.corner_sigma()))
         terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))
-        return Problem(self.variables, terms)
+        return terms
 
     def corner_sigma(self) -> Float[Tensor, " m"]:
         """Standard deviation of every sign corner in u and in v [px]."""
@@ -288,12 +345,15 @@ class Bundle(nn.Module):
         rows = self.corners
         if not len(rows):
             return {}
+        reach = _FIRST_REACH if int(self.judged) == 0 else 1.0
+        bound = self.scale.new_tensor(self.config.tukey_c * reach)
+        loss = JointTukey.by_efficiency(rows.detection, bound, row_dim=_PIXEL_DIM)
         term = CostTerm(
             residuals.sign_reprojection,
             (("pose", rows.frame), ("sign", rows.sign), ("size", rows.sign)),
             (rows.template, rows.matrix),
             rows.template.new_ones(len(rows)) / sigma,
-            Tukey(self.config.tukey_c),
+            loss.without(self.given_up[rows.detection]),
             residuals.sign_reprojection_jacobian,
             residual_blocks.sign_reprojection,
             residual_blocks.sign_reprojection_blocks,

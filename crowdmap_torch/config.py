@@ -85,12 +85,14 @@ class MapperConfig:
             road=replace(self.road, method="paper2017"),
             lane=replace(self.lane, method="paper2017"),
             crowd=replace(self.crowd, method="paper2017"),
-            # eq:ba weighs all pixels alike, and knows neither what signs are like nor a road under its lanes.
+            # eq:ba weighs all pixels alike, and knows neither what signs are like nor a road under its lanes; what a
+            # detection does to its own pose it does not ask.
             adjust=replace(
                 self.adjust,
                 habit=SignHabit(facing_rad=math.inf, upright_rad=math.inf, log_size=math.inf),
                 lane_height_sigma_m=math.inf,
                 lane_correlation=1.0,
+                innovation_chance=0.0,
             ),
         )
 

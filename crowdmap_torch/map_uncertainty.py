@@ -94,7 +94,7 @@ def map_uncertainty(
     nodes = bundle.prior.nodes
     journeys = len(values["bias"])
     expected = bundle.prior.expected_scale(values["drift"], bundle.prior_scale)
-    problem = bundle.problem(held=False, prior_scale=expected)
+    problem = bundle.information(expected)
     normal = bundle.backend().assemble(problem, values)
     to_bias = _to_bias(values["pose"][nodes.first])
     count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,10 +20,12 @@ _CURVATURE = 1e-3
 
 @dataclass(frozen=True)
 class CornerObservations(Rows):
-    """Sign corners seen in frames."""
+    """Sign corners seen in frames; those of a detection are adjacent."""
 
     frame: Int[Tensor, " m"]
     """Frame, counted over all journeys."""
+    detection: Int[Tensor, " m"]
+    """Sign detection, counted over all journeys, twice: the centre of a box is one of its own."""
     sign: Int[Tensor, " m"]
     template: Float[Tensor, "m 2"]
     """The corner for width and height one, on the sign's plane."""
@@ -96,17 +99,26 @@ def corner_observations(
     centres are rows of their own, and their corners know no more than that.
     """
     offsets = frame_offsets(journeys)
+    begins = accumulate((len(journey.signs) for journey in journeys), initial=0)
     return concatenate(
         [
-            _corners(journey, association, signs, offset, box_sigma)
-            for journey, association, offset in zip(journeys, associations, offsets, strict=False)
+            _corners(journey, association, signs, offset, detections, box_sigma)
+            for journey, association, offset, detections in zip(
+                journeys, associations, offsets, begins, strict=False
+            )
         ]
     )
 
 
 def _corners(
-    journey: Journey, association: Association, signs: Signs, offset: int, box_sigma: float
+    journey: Journey,
+    association: Association,
+    signs: Signs,
+    offset: int,
+    before: int,
+    box_sigma: float,
 ) -> CornerObservations:
+    """The rows of one journey, with `offset` frames and `before` detections before it."""
     detections = journey.signs
     used = torch.nonzero(association.sign >= 0)[:, 0]
     used = used[detections.shape[used] == signs.shape[association.sign[used]]]
@@ -137,6 +149,7 @@ def _corners(
     loose[: len(row)] = box_sigma / 2 * box[row] * boxed[row]
     return CornerObservations(
         frame=detections.frame[used][of] + offset,
+        detection=2 * (used[of] + before) + (torch.arange(len(of), device=of.device) >= len(row)),
         sign=sign[of],
         template=template,
         matrix=camera.observation_matrix(journey.rig.camera, px, ideal),

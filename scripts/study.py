@@ -21,6 +21,7 @@ STUDIES = {
     "noise": "pixel noise, bias, outliers and missed detections swept",
     "bad-drives": "one bad drive among good ones",
     "control": "a few surveyed signs pin the map",
+    "convergence": "whether a start a metre off and gross outliers decide",
     "honesty": "whether the map knows how wrong it is",
     "efficiency": "ours beside the best linear estimator and the Cramer-Rao bound",
     "real": "real drives: kitti-signs by sequence",

@@ -43,7 +43,7 @@ def dense(bundle: Bundle):
     with torch.no_grad():
         values = bundle.values()
         scale = bundle.prior.expected_scale(values["drift"], bundle.prior_scale)
-        problem = bundle.problem(held=False, prior_scale=scale)
+        problem = bundle.information(scale)
         normal = DenseBackend().assemble(problem, values)
         covariance = normal.covariance(floor=1e-9)[0]
 

@@ -196,6 +196,19 @@ def test_frames_are_counted_over_all_journeys(signs: Signs):
     assert rows.frame.unique().tolist() == [0, 1, 2, 3]
 
 
+def test_corners_of_a_detection_are_adjacent_and_numbered_over_all_journeys(signs: Signs):
+    one = seen(signs, make_rig(), metres(2, 1.0), torch.zeros(6).long())
+    rows = corner_observations([one[0], one[0]], [one[1], one[1]], signs, box_sigma=0.5)
+    label, count = torch.unique_consecutive(rows.detection, return_counts=True)
+    assert len(label) == len(label.unique())
+    begins = torch.cat((torch.zeros(1).long(), count.cumsum(0)[:-1]))
+    for column in (rows.frame, rows.sign):
+        assert torch.equal(column[begins].repeat_interleave(count), column)
+    is_centre = rows.template[begins].norm(dim=-1) == 0
+    expected = polygon.CORNER_COUNT[signs.shape[rows.sign[begins]]]
+    assert torch.equal(count, torch.where(is_centre, 1, expected))
+
+
 def test_journeys_without_signs_give_no_rows(signs: Signs):
     journey = make_journey(make_rig(), driving_east(metres(3, 1.0)))
     none = torch.zeros(0, dtype=torch.int64)

@@ -227,6 +227,35 @@ class ChainNormalEquations:
         self.workspace.factor = _Factor(whiten, towards, reduced)
         return torch.cholesky_inverse(reduced, upper=True)
 
+    def block_covariances(self) -> Float[Tensor, "n k k"]:
+        """Covariance of every eliminated block with all that stays held: the diagonal blocks of the chains' inverse.
+
+        From the last level to the first, a block's covariance is that of its own diagonal and what its neighbours add;
+        what two neighbours have in common is known once the later one is (Takahashi, Fagan and Chen 1973).
+        """
+        structure, k = self.structure, self.diagonal.shape[-1]
+        nothing = torch.zeros_like(self.diagonal[..., 0])
+        _, _, whiten, towards = self._reduce(nothing, torch.zeros_like(self.gradient))
+        found = self.diagonal.new_zeros(len(structure.order), k, k)
+        # With the block that follows, of those known so far.
+        crossed = torch.zeros_like(found)
+        batches = [batch for level in structure.levels for batch in level.batches]
+        steps = list(zip(batches, whiten, towards, strict=True))
+        for batch, own, leads in reversed(steps):
+            around = found[batch.neighbour]
+            if batch.neighbour.shape[1] == 2:
+                before = batch.neighbour[:, 0]
+                both = crossed[before]
+                upper = torch.cat((around[:, 0], both), dim=-1)
+                beside = torch.cat((upper, torch.cat((both.mT, around[:, 1]), dim=-1)), dim=1)
+                with_neighbours = leads @ beside
+                crossed[before] = with_neighbours[..., :k].mT
+                crossed[batch.place] = with_neighbours[..., k:]
+            else:
+                with_neighbours = leads @ around[:, 0]
+            found[batch.place] = own.mT @ own + with_neighbours @ leads.mT
+        return found[structure.place]
+
     def solve_reduced(self, right: Float[Tensor, "r m"]) -> Float[Tensor, "r m"]:
         """Landmarks that solve the last factorised reduced system for other right-hand sides."""
         assert self.workspace.factor is not None

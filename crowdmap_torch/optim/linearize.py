@@ -12,6 +12,7 @@ from torch.func import jacfwd, vmap
 
 from crowdmap_torch.optim.parallel import in_order
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
+from crowdmap_torch.optim.robust import JointLoss
 
 CHUNK_ROWS = 1 << 14
 """Rows that are linearised at once; bounds the memory, whatever the size of the problem."""
@@ -34,14 +35,20 @@ def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
         slots=tuple((name, block[index]) for name, block in term.slots),
         constants=tuple(constant[index] for constant in term.constants),
         weight=None if term.weight is None else term.weight[index],
+        loss=term.loss.of_rows(index) if isinstance(term.loss, JointLoss) else term.loss,
     )
 
 
 def chunks(term: CostTerm, size: int = CHUNK_ROWS) -> Iterator[tuple[slice, CostTerm]]:
-    """The term in pieces of at most `size` rows."""
-    for start in range(0, len(term), size):
-        piece = slice(start, min(start + size, len(term)))
+    """The term in pieces of at most `size` rows; those that a loss joins stay in one piece, however many they are."""
+    start = 0
+    while start < len(term):
+        stop = min(start + size, len(term))
+        if isinstance(term.loss, JointLoss):
+            stop = term.loss.cut(start, stop)
+        piece = slice(start, stop)
         yield piece, rows(term, piece)
+        start = stop
 
 
 def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:

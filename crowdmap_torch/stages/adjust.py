@@ -161,6 +161,8 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend) -> tuple[lm.LmState,
         return state, state.done
     bundle.fold(dict(state.values))
     at_rest = bundle.refresh()
+    if at_rest and (state.done or int(bundle.judged) == 0):
+        at_rest = not bundle.judge(backend)
     if state.done and at_rest:
         return state, True
     return lm.changed(state), False

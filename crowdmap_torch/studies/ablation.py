@@ -43,7 +43,8 @@ VARIANTS: Mapping[str, MapperConfig] = {
     "nothing brought back": replace(OURS, harvest=replace(OURS.harvest, reach_m=0.0)),
     "adjustment without drift": _adjusted_with(drift_spacing_m=1e6),
     "adjustment without lanes": _adjusted_with(max_ground_distance_m=0.0),
-    "adjustment without Tukey": _adjusted_with(tukey_c=1e3),
+    "adjustment without innovations": _adjusted_with(innovation_chance=0.0),
+    "adjustment without Tukey and innovations": _adjusted_with(tukey_c=1e3, innovation_chance=0.0),
     "all of the paper": MapperConfig(method="paper2017"),
 }
 """What is switched off, by what the configuration can say."""

@@ -20,8 +20,9 @@ from crowdmap_torch.evaluation.visibility import observable_signs
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.io.truth import JourneyTruth, Truth
 from crowdmap_torch.observations import CornerObservations
-from crowdmap_torch.optim.linearize import linearize
+from crowdmap_torch.optim.linearize import linearize, rows
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.optim.robust import Quadratic
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
@@ -215,18 +216,13 @@ def _true_terms(
     bundle: Bundle, simulation: SimulationConfig, pose: Int[Tensor, " f"]
 ) -> Sequence[CostTerm]:
     """The journey's observations with their true sigmas, outliers left out."""
-    terms = bundle.problem(held=False).terms
+    terms = bundle.problem().terms
     low, high = int(pose[0]), int(pose[-1])
 
     def of_journey(term: CostTerm, weight: Tensor, kept: Tensor) -> CostTerm:
         at = term.slots[0][1]
-        rows = torch.nonzero(kept & (at >= low) & (at <= high))[:, 0]
-        return replace(
-            term,
-            slots=tuple((name, index[rows]) for name, index in term.slots),
-            constants=tuple(constant[rows] for constant in term.constants),
-            weight=weight[rows],
-        )
+        own = torch.nonzero(kept & (at >= low) & (at <= high))[:, 0]
+        return rows(replace(term, weight=weight, loss=Quadratic()), own)
 
     corner, lane = terms["sign_reprojection"], terms["lane_reprojection"]
     sigma = _true_sigma(bundle, bundle.corners, simulation.signs)

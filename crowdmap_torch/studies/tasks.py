@@ -23,6 +23,7 @@ from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.simulate import SimulationConfig, write_dataset
 from crowdmap_torch.studies.folder import StudyFolder, dataset_name, digest, journey_config_hash
 from crowdmap_torch.studies.measure import (
+    Drives,
     load_drives,
     measure_journey,
     measure_map,
@@ -176,11 +177,7 @@ class MeasureMap:
 
     def run(self, folder: StudyFolder) -> None:
         """Maps the journeys together and measures the map."""
-        drives = load_drives(folder.dataset(self.simulation)).select(self.rows)
-        maps = [
-            _numbered(folder.read_journey_map(journey.key), number)
-            for number, journey in enumerate(self.journeys())
-        ]
+        drives, maps = self.load(folder)
         measured = measure_map(
             drives, maps, self.config, adjusted=self.adjusted, control=self.control
         )
@@ -188,6 +185,15 @@ class MeasureMap:
             stated = torch.tensor(measured["shared_covariance"], dtype=torch.float64)
             measured["shared"] = shared_part(drives, self.simulation.positioning, stated)
         folder.write_result(self.key, measured)
+
+    def load(self, folder: StudyFolder) -> tuple[Drives, list[JourneyMap]]:
+        """The journeys and the map of each of them."""
+        drives = load_drives(folder.dataset(self.simulation)).select(self.rows)
+        maps = [
+            _numbered(folder.read_journey_map(journey.key), number)
+            for number, journey in enumerate(self.journeys())
+        ]
+        return drives, maps
 
 
 @dataclass(frozen=True)

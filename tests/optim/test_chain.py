@@ -176,6 +176,18 @@ def test_marginal_covariance_is_the_block_of_the_dense_inverse():
     )
 
 
+@pytest.mark.parametrize("lengths", [[1], [2], [10, 1, 9, 8], [85, 40], [19, 2, 33]])
+def test_block_covariances_are_those_of_the_dense_inverse_with_landmarks_held(lengths):
+    built, values, chain = problem(lengths, seed=4)
+    backend = ChainBackend("pose", chain, group_size=5)
+    found = backend.assemble(built, values).block_covariances()
+    n = len(chain)
+    of_chains = DenseBackend().assemble(built, values).hessian[0, : 3 * n, : 3 * n]
+    inverse = torch.linalg.inv(of_chains).view(n, 3, n, 3)
+    every = torch.arange(n)
+    torch.testing.assert_close(found, inverse[every, :, every], rtol=1e-8, atol=1e-12)
+
+
 def test_both_back_ends_reach_the_same_minimum():
     built, values, chain = problem([30, 20], seed=1)
     config = lm.LmConfig(cost_tolerance=1e-12)

@@ -36,6 +36,23 @@ def test_conjugate_gradients_give_the_dense_step(lengths):
         torch.testing.assert_close(mine.norm, theirs.norm)
 
 
+@pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
+def test_block_covariances_are_those_of_the_dense_inverse_with_all_else_held(lengths):
+    problem, values, backend, _ = drives(lengths)
+    dense = DenseBackend().assemble(problem, values)
+    rows = torch.cat([rows_of(dense, name) for name in ("pose", "drift")])
+    inverse = torch.linalg.inv(dense.hessian[0][rows[:, None], rows])
+    k = problem.variables["drift"].tangent_dim
+    n = len(rows) // k
+    every = torch.arange(n)
+    expected = inverse.view(n, k, n, k)[every, :, every]
+    for one in (backend, matrix_free(backend)):
+        inner = one.assemble(problem, values).inner
+        by_name = inner.unstack(inner.block_covariances())
+        found = torch.cat([by_name[name] for name in ("pose", "drift")])
+        torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-12)
+
+
 def test_a_chain_alone_is_solved_too():
     chain = torch.zeros(9, dtype=torch.long)
     every = torch.arange(9)
