@@ -76,6 +76,9 @@ class Watch:
         names = ("sign_px", "lane_px", "lane_correlation")
         scales = dict(zip(names, bundle.scale.tolist(), strict=True))
         self._log.log_scalars({f"scale/{k}": v for k, v in scales.items()}, number + 1)
+        if len(bundle.corners):
+            given_up = bundle.given_up[bundle.corners.detection].double().mean()
+            self._log.log_scalars({"robust/given_up": float(given_up)}, number + 1)
 
     @torch.no_grad()
     def finish(self, bundle: Bundle, hd_map: HdMap) -> None:

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from crowdmap_torch import mapper
 from crowdmap_torch.config import MapperConfig, load_config
@@ -97,6 +98,13 @@ def columns(path: Path) -> set[str]:
 
 
 # What a run writes.
+
+
+def test_the_board_tells_which_share_of_sign_corners_was_given_up(run: Path):
+    board = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0}).Reload()
+    share = [event.value for event in board.Scalars("robust/given_up")]
+    # None before detections are judged; of the simulation's outliers, 1 %, some are afterwards.
+    assert share[0] == 0 and 0 < share[-1] < 0.05
 
 
 def test_every_output_is_there_and_nothing_half_written(run: Path, tiny: Dataset):
