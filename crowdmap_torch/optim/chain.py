@@ -234,13 +234,15 @@ class ChainNormalEquations:
         what two neighbours have in common is known once the later one is (Takahashi, Fagan and Chen 1973).
         """
         structure, k = self.structure, self.diagonal.shape[-1]
-        nothing = torch.zeros_like(self.diagonal[..., 0])
-        _, _, whiten, towards = self._reduce(nothing, torch.zeros_like(self.gradient))
+        diagonal, link = self._in_order(self.diagonal)
+        steps = []
+        for batch in (batch for level in structure.levels for batch in level.batches):
+            lead = _lead(batch, diagonal, link)
+            _pass_on(batch, lead.square, diagonal, link)
+            steps.append((batch, lead.whiten, lead.towards))
         found = self.diagonal.new_zeros(len(structure.order), k, k)
         # With the block that follows, of those known so far.
         crossed = torch.zeros_like(found)
-        batches = [batch for level in structure.levels for batch in level.batches]
-        steps = list(zip(batches, whiten, towards, strict=True))
         for batch, own, leads in reversed(steps):
             around = found[batch.neighbour]
             if batch.neighbour.shape[1] == 2:
@@ -333,12 +335,7 @@ class ChainNormalEquations:
         # One row and column more for the gradient, one for padding.
         system = torch.nn.functional.pad(self.hessian + torch.diag(added), (0, 2, 0, 2))
         system[dim, :dim] = self.gradient
-        # In the order of elimination; a block that stands for none has no links, and a diagonal that does no harm.
-        k = self.diagonal.shape[-1]
-        none = torch.eye(k, dtype=store.dtype, device=store.device)[None]
-        diagonal = torch.cat((self.diagonal + torch.diag_embed(added_chain), none))
-        diagonal = diagonal[structure.order]
-        link = torch.cat((self.link, torch.zeros_like(none)))[structure.order]
+        diagonal, link = self._in_order(self.diagonal + torch.diag_embed(added_chain))
         whiten, towards = [], []
         for level in structure.levels:
             parts = in_order(
@@ -347,12 +344,22 @@ class ChainNormalEquations:
                 store.device,
             )
             for batch, part in zip(level.batches, parts, strict=True):
-                whiten.append(part.whiten)
-                towards.append(part.towards)
-                _pass_on(batch, part.square, diagonal, link)
+                whiten.append(part.lead.whiten)
+                towards.append(part.lead.towards)
+                _pass_on(batch, part.lead.square, diagonal, link)
                 system.view(-1).index_add_(0, part.at, part.product)
                 store.index_add_(0, batch.fill.flatten(), part.fill)
         return system[:dim, :dim], system[dim, :dim], whiten, towards
+
+    def _in_order(self, diagonal: Float[Tensor, "n k k"]) -> tuple[Tensor, Tensor]:
+        """Diagonal blocks and links in the order of elimination.
+
+        A block that stands for none has no links, and a diagonal that does no harm.
+        """
+        order, k = self.structure.order, diagonal.shape[-1]
+        none = torch.eye(k, dtype=diagonal.dtype, device=diagonal.device)[None]
+        links = torch.cat((self.link, torch.zeros_like(none)))
+        return torch.cat((diagonal, none))[order], links[order]
 
     def _substitute(
         self, packed: Tensor, factor: _Factor, gradient: Tensor | None = None
@@ -402,8 +409,8 @@ def _rows(batch: Batch, store: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class _Part:
-    """What the elimination of a batch leaves to others."""
+class _Lead:
+    """What the elimination of a batch leaves to other blocks of its chains."""
 
     whiten: Float[Tensor, "e k k"]
     """Inverse Cholesky factors of the diagonals."""
@@ -411,6 +418,25 @@ class _Part:
     """Minus the inverse diagonals times the links to the neighbours."""
     square: Float[Tensor, "e _ _"]
     """To be added to the neighbours' diagonals and to the link between them."""
+
+
+def _lead(batch: Batch, diagonal: Tensor, link: Tensor) -> _Lead:
+    """What a batch leaves behind of itself."""
+    factor, failed = torch.linalg.cholesky_ex(diagonal[batch.place])
+    # A block that is not positive definite spoils all that follows, and the whole step fails.
+    inverse = torch.cholesky_inverse(factor).where((failed == 0)[:, None, None], torch.nan)
+    links = link[batch.place]
+    if batch.neighbour.shape[1] == 2:
+        links = torch.cat((link[batch.neighbour[:, 0]].mT, links), dim=-1)
+    leads = (inverse @ links).neg_()
+    return _Lead(factor.mT @ inverse, leads, links.mT @ leads)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What the elimination of a batch leaves to others."""
+
+    lead: _Lead
     at: Int[Tensor, " ww"]
     product: Float[Tensor, " ww"]
     """To be added to the reduced system, and where."""
@@ -420,20 +446,13 @@ class _Part:
 
 def _eliminate(batch: Batch, diagonal: Tensor, link: Tensor, store: Tensor, stride: int) -> _Part:
     """What a batch leaves behind; its own rows are solved in place."""
-    groups, size, w, sides = batch.fill.shape
+    groups, size, w, _ = batch.fill.shape
     k = store.shape[-1]
-    factor, failed = torch.linalg.cholesky_ex(diagonal[batch.place])
-    # A block that is not positive definite spoils all that follows, and the whole step fails.
-    inverse = torch.cholesky_inverse(factor).where((failed == 0)[:, None, None], torch.nan)
-    links = link[batch.place]
-    if sides == 2:
-        links = torch.cat((link[batch.neighbour[:, 0]].mT, links), dim=-1)
-    leads = (inverse @ links).neg_()
+    lead = _lead(batch, diagonal, link)
     rows = _rows(batch, store)
     # Adding rows as they are is several times faster than subtracting them: the leads carry the sign.
-    fill = (rows @ leads).view(-1, k)
-    whiten = factor.mT @ inverse
-    rows.copy_(rows @ whiten.mT)
+    fill = (rows @ lead.towards).view(-1, k)
+    rows.copy_(rows @ lead.whiten.mT)
     wide = rows.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
     half = w // 2 if w >= _WORTH_HALVING else w
     ats, products = [], []
@@ -443,7 +462,7 @@ def _eliminate(batch: Batch, diagonal: Tensor, link: Tensor, store: Tensor, stri
         column = batch.columns[:, there]
         ats.append((batch.columns[:, here, None] * stride + column[:, None]).flatten())
         products.append((wide[:, here] @ wide[:, there].mT).neg_().flatten())
-    return _Part(whiten, leads, links.mT @ leads, torch.cat(ats), torch.cat(products), fill)
+    return _Part(lead, torch.cat(ats), torch.cat(products), fill)
 
 
 def _assemble(
