@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from crowdmap_torch.bundle import Bundle
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.evaluation.statistics import plain
-from crowdmap_torch.mapper import FirstMap, JourneyMap, build_bundle, first_map
+from crowdmap_torch.mapper import FirstMap, build_bundle, first_map
 from crowdmap_torch.observations import CornerObservations
 from crowdmap_torch.simulate import SimulationConfig
 from crowdmap_torch.stages import adjust
@@ -67,19 +68,15 @@ class MeasureConvergence:
         config, journeys = MapperConfig(), drives.dataset.journeys
         begun = time.process_time()
         first = first_map(journeys, maps, config)
-        corners = build_bundle(journeys, maps, first, config).corners
-        pushed, left_out = outliers(corners, torch.Generator().manual_seed(self.simulation.seed))
-        far = a_metre_off(first, torch.Generator().manual_seed(self.simulation.seed))
-        clean, *others = (
-            _adjusted(journeys, maps, start, config, rows)
-            for start, rows in (
-                (first, corners),
-                (first, pushed),
-                (first, left_out),
-                (far, corners),
-            )
+        generator = torch.Generator().manual_seed(self.simulation.seed)
+        far = a_metre_off(first, generator)
+        bundles = [build_bundle(journeys, maps, start, config) for start in (first, far)]
+        for rows in outliers(bundles[0].corners, generator):
+            bundles.append(build_bundle(journeys, maps, first, config))
+            bundles[-1].corners = rows
+        clean, from_far, with_outliers, without = (
+            _adjusted(bundle, first, journeys) for bundle in bundles
         )
-        with_outliers, without, from_far = others
         mask = first.signs.corner_mask
         measured: dict[str, Any] = {
             "signs": len(first.signs),
@@ -138,15 +135,7 @@ class _Adjusted:
 
 
 @torch.no_grad()
-def _adjusted(
-    journeys: Sequence[Journey],
-    maps: Sequence[JourneyMap],
-    first: FirstMap,
-    config: MapperConfig,
-    rows: CornerObservations,
-) -> _Adjusted:
-    bundle = build_bundle(journeys, maps, first, config)
-    bundle.corners = rows
+def _adjusted(bundle: Bundle, first: FirstMap, journeys: Sequence[Journey]) -> _Adjusted:
     adjust.adjust(bundle)
     signs, _ = adjust.read_map(bundle, first.signs, first.lanes)
     values = bundle.values()
