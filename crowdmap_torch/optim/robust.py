@@ -9,7 +9,7 @@ from typing import Protocol, Self, runtime_checkable
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import root_scalar
-from scipy.stats import chi2
+from scipy.special import gammainc
 from torch import Tensor
 
 _EFFICIENCY = 0.95
@@ -194,7 +194,7 @@ def _at_normal(c: float, dim: int) -> tuple[float, float]:
         factor = 1.0
         for i in range(k):
             factor *= dim + 2 * i
-        return factor * float(chi2.cdf(c * c, dim + 2 * k))
+        return factor * float(gammainc(dim / 2 + k, c * c / 2))
 
     below = [moment(k) / c ** (2 * k) for k in range(6)]
     mean = below[0] - 2 * below[1] + below[2]
