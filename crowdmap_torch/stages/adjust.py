@@ -153,8 +153,8 @@ def start(bundle: Bundle) -> lm.LmState:
 def adjust_step(bundle: Bundle, state: lm.LmState, backend) -> tuple[lm.LmState, bool]:
     """One step of the solver, folded into the bundle, and whether the adjustment is finished.
 
-    Lanes are matched anew and the scales narrowed after every step that was taken; it is finished when the solver stops
-    while the scales are at rest.
+    Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
+    first come to rest, and when the solver stops. It is finished when that changes nothing.
     """
     state = lm.step(bundle.problem(), state, bundle.config.lm, backend=backend)
     if not bool(state.accepted.all()):
