@@ -251,12 +251,12 @@ class Bundle(nn.Module):
         """
         if int(self.judged) >= _MOST_JUDGEMENTS:
             return False
-        values, given_up = self.values(), torch.zeros_like(self.given_up)
-        judged = self._corner_term(self.corner_sigma()) if self.config.innovation_chance else {}
-        for term in judged.values():
-            inner = backend.assemble(self.problem(), values).inner
+        problem, values, given_up = self.problem(), self.values(), torch.zeros_like(self.given_up)
+        if self.config.innovation_chance and len(self.corners):
+            inner = backend.assemble(problem, values).inner
             of_pose = inner.unstack(inner.block_covariances())["pose"]
-            found = innovations(term, self.variables, values, of_pose, row_dim=_PIXEL_DIM)
+            term = problem.terms["sign_reprojection"]
+            found = innovations(term, self.variables, values, of_pose)
             assert isinstance(term.loss, JointTukey)
             too_large = found.are_too_large(self.config.innovation_chance)
             given_up[self.corners.detection] = too_large[term.loss.run]
@@ -321,7 +321,7 @@ class Bundle(nn.Module):
         The weights of detections are raised to what they keep of the information.
         """
         terms = {
-            name: replace(term, loss=term.loss.informative(row_dim=_PIXEL_DIM))
+            name: replace(term, loss=term.loss.informative())
             if isinstance(term.loss, JointTukey)
             else term
             for name, term in self._terms(prior_scale).items()

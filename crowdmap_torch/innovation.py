@@ -49,10 +49,8 @@ def innovations(
     variables: dict[str, Variable],
     values: Values,
     covariance: Float[Tensor, "p k k"],
-    *,
-    row_dim: int,
 ) -> Innovations:
-    """The innovations of the detections of a term with rows of `row_dim` numbers, whose loss is theirs as a whole.
+    """The innovations of the detections of a term whose loss is theirs as a whole.
 
     `values` are the minimum, and `covariance` is there that of the blocks of the term's first slot, of which the rows of
     a detection touch one and the same, with all else known.
@@ -84,4 +82,4 @@ def innovations(
     force = force + pulled
     # The residual's covariance is one and what the block adds; its inverse by Woodbury's identity.
     own = (force * torch.linalg.solve_ex(without + matrix, force).result)[..., 0].sum(-1)
-    return Innovations(square - own, row_dim * count, weight)
+    return Innovations(square - own, loss.row_dim * count, weight)

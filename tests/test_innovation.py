@@ -73,7 +73,7 @@ def covariance(problem: Problem, values: dict[str, Tensor]) -> Tensor:
 def judged(problem: Problem, values: dict[str, Tensor]) -> Innovations:
     term = problem.terms["seen"]
     P = covariance(problem, values)
-    return innovations(term, dict(problem.variables), values, P, row_dim=ROW_DIM)
+    return innovations(term, dict(problem.variables), values, P)
 
 
 def by_leaving_out(problem: Problem, values: dict[str, Tensor], pose: int) -> Tensor:

@@ -103,6 +103,8 @@ class JointTukey:
     """Bound of each row's detection in standard deviations."""
     gain: Float[Tensor, " m"]
     """Factor on the loss of each row's detection."""
+    row_dim: int
+    """Numbers that each row consists of."""
 
     @classmethod
     def by_efficiency(
@@ -112,14 +114,14 @@ class JointTukey:
 
         The rows of a detection are adjacent and have the same `label`.
         """
-        run = _runs(label)
-        count = torch.bincount(run)
+        _, run, count = torch.unique_consecutive(label, return_inverse=True, return_counts=True)
         sizes = range(1, int(count.max()) + 1 if len(count) else 1)
         ratio = c.new_tensor([1.0] + [_bound(row_dim * size) / _bound(1) for size in sizes])
         count = count[run]
-        return cls(run, 1 / count.to(c), c * ratio[count], torch.ones_like(c).expand(len(run)))
+        gain = torch.ones_like(c).expand(len(run))
+        return cls(run, 1 / count.to(c), c * ratio[count], gain, row_dim)
 
-    def informative(self, *, row_dim: int) -> JointTukey:
+    def informative(self) -> JointTukey:
         """The same weights, raised so that in the mean over normal residuals they are the information that is kept.
 
         As they are they lower the Gauss-Newton Hessian by more than the estimate loses: covariances would be too large.
@@ -127,7 +129,7 @@ class JointTukey:
         kinds, kind = torch.unique(torch.stack((self.c, self.share)), dim=1, return_inverse=True)
         gain = []
         for c, share in kinds.T.tolist():
-            mean_weight, efficiency = _at_normal(c, round(row_dim / share))
+            mean_weight, efficiency = _at_normal(c, round(self.row_dim / share))
             gain.append(efficiency / mean_weight)
         return replace(self, gain=self.gain * self.c.new_tensor(gain)[kind])
 
@@ -147,8 +149,8 @@ class JointTukey:
         """The loss of some whole detections."""
         run = self.run[index]
         if isinstance(index, Tensor):
-            run = _runs(run)
-        return JointTukey(run, self.share[index], self.c[index], self.gain[index])
+            _, run = torch.unique_consecutive(run, return_inverse=True)
+        return JointTukey(run, self.share[index], self.c[index], self.gain[index], self.row_dim)
 
     def cut(self, start: int, stop: int) -> int:
         """The last beginning of a detection behind `start` and up to `stop`, or else the first behind that."""
@@ -167,13 +169,6 @@ class JointTukey:
         total = s.new_zeros(int(self.run[-1] - self.run[0]) + 1)
         own = self.run - self.run[0]
         return total.index_add_(0, own, s)[own]
-
-
-def _runs(label: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
-    """Counted from zero, the run of equal labels that each row is in."""
-    begins = torch.zeros_like(label)
-    begins[1:] = label[1:] != label[:-1]
-    return begins.cumsum(0)
 
 
 @lru_cache(maxsize=64)

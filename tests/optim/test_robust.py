@@ -46,7 +46,7 @@ def test_the_bound_keeps_the_efficiency_of_one_number(rows: int):
 @pytest.mark.parametrize("rows", [1, 4, 8])
 def test_informative_weights_are_in_the_mean_what_is_kept(rows: int):
     count = 200_000
-    loss = whole(torch.arange(count).repeat_interleave(rows)).informative(row_dim=ROW_DIM)
+    loss = whole(torch.arange(count).repeat_interleave(rows)).informative()
     s = normal(count * rows, ROW_DIM, seed=1).square().sum(-1)
     assert float(loss.weight(s).mean()) == pytest.approx(0.95, abs=0.01)
 
@@ -59,7 +59,7 @@ def test_one_number_alone_has_the_plain_loss():
 
 
 def test_weights_are_the_derivative_of_the_loss():
-    for loss in (whole(LABEL), whole(LABEL).informative(row_dim=ROW_DIM)):
+    for loss in (whole(LABEL), whole(LABEL).informative()):
         s = (8 * normal(len(LABEL), seed=2).square()).requires_grad_()
         (slope,) = torch.autograd.grad(loss.rho(s).sum(), s)
         torch.testing.assert_close(loss.weight(s), slope)
