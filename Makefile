@@ -6,10 +6,10 @@ STAMP := $(VENV)/.installed
 DEMO := demo
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format
+.PHONY: help install demo test test-coverage lint format
 
 help:  ## this list
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 16
 
 install: $(STAMP)  ## the package and its tools in .venv
 
@@ -22,11 +22,17 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)  ## simulate a street, map it, compare the map with its survey; everything under demo/
 	rm -rf $(DEMO)/street
-	$(BIN)/python scripts/simulate.py $(DEMO)/street --world street --journeys 8 --seed 1
-	$(BIN)/python scripts/optimize.py $(DEMO)/street --out $(DEMO)/run --overwrite
+	$(BIN)/crowdmap simulate $(DEMO)/street --world street --journeys 8 --seed 1
+	$(BIN)/crowdmap optimize $(DEMO)/street --out $(DEMO)/run --overwrite
+
+# Each core has a process of its own, and files stay whole: their fixtures are made once. Annotations of shapes are checked.
+TESTS := CROWDMAP_CHECK_SHAPES=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist loadfile
 
 test: $(STAMP)  ## the test suite
-	$(BIN)/python -m pytest -q
+	$(TESTS)
+
+test-coverage: $(STAMP)  ## the test suite, and which lines it does not reach
+	$(TESTS) --cov=crowdmap_torch --cov-report=term-missing:skip-covered
 
 lint: $(STAMP)  ## ruff and pyright
 	$(BIN)/ruff check .

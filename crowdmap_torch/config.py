@@ -14,18 +14,19 @@ from typing import Any, TypeVar
 
 import yaml
 
-from crowdmap_torch.bundle import AdjustConfig
-from crowdmap_torch.control import ControlConfig
-from crowdmap_torch.crowd import CrowdConfig
-from crowdmap_torch.sign_habit import SignHabit
-from crowdmap_torch.stages.associate import SignAssociationConfig
-from crowdmap_torch.stages.associate_lanes import LaneAssociationConfig
-from crowdmap_torch.stages.cluster_lanes import LaneClusterConfig
-from crowdmap_torch.stages.harvest import HarvestConfig
-from crowdmap_torch.stages.join_lanes import LaneJoinConfig
-from crowdmap_torch.stages.lanes import LaneConfig
-from crowdmap_torch.stages.road import RoadConfig
-from crowdmap_torch.stages.signs import SignTriangulationConfig
+from crowdmap_torch.adjustment.bundle import AdjustConfig
+from crowdmap_torch.crowd_lanes.cluster import LaneClusterConfig
+from crowdmap_torch.crowd_lanes.join import LaneJoinConfig
+from crowdmap_torch.crowd_signs.complete_tracks import CompleteTracksConfig
+from crowdmap_torch.crowd_signs.register import CrowdConfig
+from crowdmap_torch.lanes.reconstruct import LaneConfig
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.residuals.sign_prior import SignHabit
+from crowdmap_torch.road.estimate import RoadConfig
+from crowdmap_torch.signs.triangulate import SignTriangulationConfig
+from crowdmap_torch.survey.control import ControlConfig
+from crowdmap_torch.tracking.lane_features import LaneAssociationConfig
+from crowdmap_torch.tracking.sign_features import SignAssociationConfig
 
 Config = TypeVar("Config")
 
@@ -41,6 +42,8 @@ class MapperConfig:
 
     How the paper regularises poses (V-B, footnote) it does not say: both have the same prior of them.
     """
+    positioning: PositioningNoise = field(default_factory=PositioningNoise)
+    """What the poses of every journey get wrong: all sections read it."""
     sign_association: SignAssociationConfig = field(default_factory=SignAssociationConfig)
     """IV-A, signs."""
     lane_association: LaneAssociationConfig = field(default_factory=LaneAssociationConfig)
@@ -53,8 +56,8 @@ class MapperConfig:
     """IV-D."""
     crowd: CrowdConfig = field(default_factory=CrowdConfig)
     """V-A and V-B: clustering and alignment of signs, repeated."""
-    harvest: HarvestConfig = field(default_factory=HarvestConfig)
-    """V-A: detections that clustering set aside, brought back."""
+    complete_tracks: CompleteTracksConfig = field(default_factory=CompleteTracksConfig)
+    """V-A.1: detections that clustering set aside, given back to the signs they show."""
     lane_join: LaneJoinConfig = field(default_factory=LaneJoinConfig)
     """V-A: lanes of many journeys."""
     lane_cluster: LaneClusterConfig = field(default_factory=LaneClusterConfig)

@@ -2,7 +2,7 @@
 
 One journey (section IV): detections -> tracklets -> signs; road normal; lane tracklets -> splines. Many journeys
 (section V): signs -> clusters and biases, lanes -> markers; then everything at once in bundle adjustment. `build_map`
-does it all; `scripts/optimize.py` spells out the same calls with logging between them.
+does it all; `commands/optimize.py` spells out the same calls with logging between them.
 """
 
 from __future__ import annotations
@@ -17,35 +17,30 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.bundle import Bundle
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
+from crowdmap_torch.adjustment.lane_matching import detection_lanes
 from crowdmap_torch.config import MapperConfig, config_hash
-from crowdmap_torch.control import find_control_points
-from crowdmap_torch.crowd import Crowd, associate_crowd, unbiased_signs
-from crowdmap_torch.crowd_signs import gather_signs
-from crowdmap_torch.geometry import polygon, se3
-from crowdmap_torch.landmark_ids import lane_ids, sign_ids
-from crowdmap_torch.lane_matching import detection_lanes
-from crowdmap_torch.map_uncertainty import MapUncertainty, map_uncertainty
-from crowdmap_torch.observations import station
-from crowdmap_torch.optim.levenberg_marquardt import LmState
-from crowdmap_torch.stages import adjust
-from crowdmap_torch.stages.align import unbiased_poses
-from crowdmap_torch.stages.associate import associate_signs
-from crowdmap_torch.stages.associate_lanes import associate_lanes
-from crowdmap_torch.stages.cluster_lanes import cluster_lanes
-from crowdmap_torch.stages.existence import existence
-from crowdmap_torch.stages.harvest import (
-    Harvest,
-    copies,
-    harvest_signs,
-    still_alone,
+from crowdmap_torch.crowd_lanes.cluster import cluster_lanes
+from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_lanes
+from crowdmap_torch.crowd_signs.align import unbiased_poses
+from crowdmap_torch.crowd_signs.complete_tracks import (
+    CompletedTracks,
+    associate_detections,
+    complete_tracks,
     with_evidence,
-    without_signs,
 )
-from crowdmap_torch.stages.join_lanes import join_lanes
-from crowdmap_torch.stages.lanes import LaneReport, reconstruct_lanes
-from crowdmap_torch.stages.road import estimate_road
-from crowdmap_torch.stages.signs import SignReport, triangulate_signs
+from crowdmap_torch.crowd_signs.gather import gather_signs
+from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry.trajectory import station
+from crowdmap_torch.io.maps import as_map
+from crowdmap_torch.lanes.reconstruct import LaneReport, reconstruct_lanes
+from crowdmap_torch.optim.levenberg_marquardt import LmState
+from crowdmap_torch.road.estimate import estimate_road
+from crowdmap_torch.signs.triangulate import SignReport, triangulate_signs
+from crowdmap_torch.survey.control import find_control_signs
 from crowdmap_torch.tables import (
     Association,
     Dataset,
@@ -59,6 +54,8 @@ from crowdmap_torch.tables import (
     concatenate,
     concatenate_lanes,
 )
+from crowdmap_torch.tracking.lanes import associate_lanes
+from crowdmap_torch.tracking.signs import associate_signs
 
 ProgressCall = Callable[[str, int, int], object]
 
@@ -92,9 +89,9 @@ class FirstMap:
     """Signs that too few journeys saw."""
     crowd: Crowd
     associations: tuple[Association, ...]
-    drifts: tuple[Float[Tensor, "f 6"], ...]
+    drifts: tuple[Float[Tensor, "_ 6"], ...]
     """Per journey the tangents from the given poses to those without bias."""
-    harvest: Harvest | None
+    completed: CompletedTracks | None
     """What clustering had set aside and was brought back; None with `paper2017`, which does not."""
 
 
@@ -107,7 +104,7 @@ class MapResult:
     journey_maps: tuple[JourneyMap, ...]
     first: FirstMap
     associations: tuple[Association, ...]
-    poses: tuple[Float[Tensor, "f 4 4"], ...]
+    poses: tuple[Float[Tensor, "_ 4 4"], ...]
     """Refined camera poses."""
     uncertainty: MapUncertainty
     """Of the signs and lanes of the map, tentative signs left out, and of the journeys' errors."""
@@ -134,14 +131,10 @@ def build_map(
     maps = map_journeys(journeys, config, workers=workers, progress=progress)
     first = first_map(journeys, maps, config)
     bundle = build_bundle(journeys, maps, first, config, control=control)
-    state = adjust.start(bundle)
-    backend = bundle.backend()
-    most = config.adjust.lm.max_iterations
-    for iteration in range(most):
-        state, finished = adjust.adjust_step(bundle, state, backend)
-        progress("bundle adjustment", iteration + 1, most)
-        if finished:
-            break
+    state = begun = adjust.start(bundle)
+    for iteration, after in adjust.steps(bundle, begun):
+        state = after
+        progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
     return finish_map(dataset, maps, first, bundle, state, config)
 
 
@@ -164,7 +157,10 @@ def map_journeys(
     # Pickled by hand: torch would hand every tensor over as an open file, and a fleet has thousands.
     tasks = (pickle.dumps((j, number, config)) for number, j in enumerate(journeys))
     with ProcessPoolExecutor(
-        min(workers, total), mp_context=get_context("spawn"), initializer=_use_one_core
+        min(workers, total),
+        mp_context=get_context("spawn"),
+        initializer=torch.set_num_threads,
+        initargs=(1,),
     ) as pool:
         for number, made in enumerate(pool.map(_map_pickled, tasks)):
             maps.append(pickle.loads(made))
@@ -176,9 +172,11 @@ def map_journeys(
 def map_journey(journey: Journey, number: int, config: MapperConfig) -> JourneyMap:
     """Section IV: the signs and lanes of one journey, the `number`-th of the dataset."""
     config = config.resolved()
-    tracklets = associate_signs(journey, config.sign_association)
-    signs, sign_report = triangulate_signs(journey, tracklets, config.sign_triangulation)
-    road = estimate_road(journey, config.road)
+    tracklets = associate_signs(journey, config.positioning, config.sign_association)
+    signs, sign_report = triangulate_signs(
+        journey, tracklets, config.positioning, config.sign_triangulation
+    )
+    road = estimate_road(journey, config.positioning, config.road)
     lane_tracklets = associate_lanes(journey, config.lane_association)
     lanes, lane_report = reconstruct_lanes(journey, lane_tracklets, road, config.lane)
     return JourneyMap(
@@ -198,49 +196,31 @@ def first_map(
 ) -> FirstMap:
     """Section V-A: landmarks of many journeys in clusters, the journeys' biases, and the cluster heads."""
     config = config.resolved()
+    tracklets = [m.sign_tracklets for m in maps]
     gathered = gather_signs(
         journeys,
-        [m.sign_tracklets for m in maps],
+        tracklets,
         concatenate([m.signs for m in maps]),
-        bias_sigma_m=config.crowd.align.bias_sigma_m,
+        bias_sigma_m=config.positioning.bias_sigma_m,
     )
     generator = torch.Generator().manual_seed(config.seed)
-    crowd = associate_crowd(gathered, config.crowd, generator=generator)
-    starts = [
-        unbiased_poses(journey.T_world_camera, crowd.bias, number, station(journey.T_world_camera))
-        for number, journey in enumerate(journeys)
-    ]
-    drifts = [
-        se3.local(journey.T_world_camera, start)
-        for journey, start in zip(journeys, starts, strict=True)
-    ]
+    crowd = register_crowd(gathered, config.positioning, config.crowd, generator=generator)
+    given = [journey.T_world_camera for journey in journeys]
+    poses = [unbiased_poses(T, crowd.bias, number, station(T)) for number, T in enumerate(given)]
+    drifts = tuple(se3.local(T, start) for T, start in zip(given, poses, strict=True))
+    found = associate_detections(
+        journeys, poses, tracklets, crowd, config.crowd, config.complete_tracks
+    )
+    made = [m.lanes for m in maps]
     if config.crowd.method == "paper2017":
-        pieces = concatenate_lanes([m.lanes for m in maps])
+        pieces = concatenate_lanes(made)
         lanes = cluster_lanes(pieces, config.lane_cluster, generator=generator).heads
     else:
-        moved = [_moved(m.lanes, drift) for m, drift in zip(maps, drifts, strict=True)]
-        lanes = join_lanes(concatenate_lanes(moved), config.lane_join).lanes
-    members = unbiased_signs(gathered, crowd.bias)
-    associations = tuple(
-        _sign_association(journey, m, members, crowd, number)
-        for number, (journey, m) in enumerate(zip(journeys, maps, strict=True))
+        moved = [unbiased_lanes(p, drift) for p, drift in zip(made, drifts, strict=True)]
+        lanes = join_lanes(concatenate_lanes(moved), config.positioning, config.lane_join).lanes
+    return FirstMap(
+        found.heads, lanes, found.tentative, crowd, found.associations, drifts, found.completed
     )
-    heads, tentative, harvest = crowd.heads, crowd.tentative, None
-    if config.crowd.method != "paper2017":
-        made = [m.sign_tracklets for m in maps]
-        copy = copies(journeys, starts, heads, associations, config.harvest)
-        passed, heads = crowd.report.passed[~copy], heads[~copy]
-        associations = without_signs(associations, copy)
-        harvest = harvest_signs(journeys, starts, made, heads, associations, config.harvest)
-        associations = harvest.associations
-        trusted = crowd.journey_weight > 0
-        heads = with_evidence(heads, journeys, associations, trusted, config.harvest)
-        sure = existence(heads.n_journeys, passed, config.crowd.existence)
-        heads = replace(heads, confidence=sure.to(heads.size))
-        # What a bad drive alone saw is nothing to look for.
-        tentative = tentative[trusted[tentative.journey]]
-        tentative = tentative[still_alone(tentative, made, associations)]
-    return FirstMap(heads, lanes, tentative, crowd, associations, tuple(drifts), harvest)
 
 
 def build_bundle(
@@ -260,11 +240,12 @@ def build_bundle(
         first.lanes,
         first.associations,
         first.drifts,
+        config.positioning,
         config.adjust,
-        left_out=[suspect.journey for suspect in first.crowd.report.suspects],
+        left_out=[outlier.journey for outlier in first.crowd.report.outlier_journeys],
         control=None
         if control is None
-        else find_control_points(first.signs, control, config.control),
+        else find_control_signs(first.signs, control, config.control),
     )
 
 
@@ -283,13 +264,13 @@ def finish_map(
     uncertainty = map_uncertainty(bundle, first.signs, first.lanes)
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes, uncertainty)
     associations = first.associations
-    if first.harvest is not None:
+    if first.completed is not None:
         # Once more with the adjusted poses: what the first projections were too far off for.
         made = [m.sign_tracklets for m in maps]
-        again = harvest_signs(journeys, poses, made, signs, associations, config.harvest)
+        again = complete_tracks(journeys, poses, made, signs, associations, config.complete_tracks)
         associations = again.associations
         trusted = first.crowd.journey_weight > 0
-        signs = with_evidence(signs, journeys, associations, trusted, config.harvest)
+        signs = with_evidence(signs, journeys, associations, trusted, config.complete_tracks)
     associations = tuple(
         replace(
             association,
@@ -325,74 +306,5 @@ def clusters_map(dataset: Dataset, first: FirstMap, provenance: dict | None = No
     return as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
 
 
-def as_map(
-    dataset: Dataset,
-    signs: Signs,
-    lanes: Lanes,
-    tentative: Signs,
-    associations: Sequence[Association],
-    shared: Float[Tensor, "3 3"],
-    provenance: dict,
-) -> HdMap:
-    """Signs and lanes with their identifiers, corners in the order of FORMAT.md, tentative signs behind the others."""
-    every = concatenate([signs, tentative])
-    journeys = dataset.journeys
-    T_world_sign, size = polygon.canonical(every.T_world_sign, every.size, every.shape)
-    return HdMap(
-        origin=dataset.origin,
-        signs=replace(every, T_world_sign=T_world_sign, size=size),
-        lanes=lanes,
-        sign_id=sign_ids(journeys, associations, every),
-        lane_id=lane_ids(journeys, associations, lanes),
-        type_names=dataset.type_names,
-        shared_covariance=shared,
-        provenance=provenance,
-    )
-
-
-def certain_part(hd_map: HdMap, min_confidence: float) -> HdMap:
-    """The map without its tentative signs: what readers of signs.parquet see."""
-    kept = torch.nonzero(hd_map.signs.confidence >= min_confidence)[:, 0]
-    names = tuple(hd_map.sign_id[row] for row in kept.tolist())
-    return replace(hd_map, signs=hd_map.signs[kept], sign_id=names)
-
-
 def _map_pickled(task: bytes) -> bytes:
     return pickle.dumps(map_journey(*pickle.loads(task)))
-
-
-def _use_one_core() -> None:
-    torch.set_num_threads(1)
-
-
-def _sign_association(
-    journey: Journey, journey_map: JourneyMap, members: Signs, crowd: Crowd, number: int
-) -> Association:
-    """The head that every sign detection shows, and how its corners are turned against the head's."""
-    tracklets = journey_map.sign_tracklets
-    assert tracklets.shift is not None
-    mine = torch.nonzero(members.journey == number)[:, 0]
-    row_of_tracklet = torch.full((tracklets.count + 1,), -1, device=mine.device)
-    row_of_tracklet[members.tracklet[mine]] = mine
-    # Label -1 reads the last slot, which stays -1.
-    member = row_of_tracklet[tracklets.label]
-    found = torch.nonzero(member >= 0)[:, 0]
-    head = torch.full_like(tracklets.label, -1).index_put((found,), crowd.label[member[found]])
-    used = torch.nonzero(head >= 0)[:, 0]
-    shift = torch.zeros_like(head)
-    of_member, of_head = members[member[used]], crowd.heads[head[used]]
-    turn, _ = polygon.best_shift(
-        of_head.corners_world, of_member.corners_world, polygon.corner_count(of_head.shape)
-    )
-    count = polygon.corner_count(of_head.shape)
-    shift[used] = (turn + tracklets.shift[used]) % count
-    return Association(sign=head, sign_shift=shift, lane=torch.full_like(journey.lanes.row, -1))
-
-
-def _moved(lanes: Lanes, drift: Float[Tensor, "f 6"]) -> Lanes:
-    """Lane pieces moved by the translation of their middle frame."""
-    if not len(lanes):
-        return lanes
-    shift = drift[lanes.frame, :3]
-    point = lanes.control.point_world + shift[lanes.piece_of_control]
-    return replace(lanes, control=replace(lanes.control, point_world=point))

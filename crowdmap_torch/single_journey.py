@@ -18,23 +18,21 @@ from torch import Tensor
 
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import camera
-from crowdmap_torch.stages.associate import SignAssociator
-from crowdmap_torch.stages.associate_lanes import LaneAssociator
-from crowdmap_torch.stages.lanes import reconstruct_lanes
-from crowdmap_torch.stages.road import RoadTracker
-from crowdmap_torch.stages.signs import triangulate_signs
+from crowdmap_torch.lanes.reconstruct import reconstruct_lanes
+from crowdmap_torch.road.estimate import RoadTracker
+from crowdmap_torch.signs.triangulate import triangulate_signs
 from crowdmap_torch.tables import (
     Journey,
-    LaneDetections,
     Lanes,
     Rig,
     RoadEstimate,
-    SignDetections,
     Signs,
     Tracklets,
     concatenate,
     concatenate_lanes,
 )
+from crowdmap_torch.tracking.lanes import LaneAssociator
+from crowdmap_torch.tracking.signs import SignAssociator
 
 MAX_OPEN_FRAMES = 1500
 """A landmark in view for longer is mapped from its latest frames: a car may stand at a light for an hour."""
@@ -63,6 +61,18 @@ class StepResult:
 
 
 @dataclass(frozen=True)
+class _HeldFrame:
+    """A frame that a landmark in sight, or an unfinished stretch, still needs."""
+
+    part: Journey
+    sign_label: Int[Tensor, " d"]
+    """Tracklet of each sign detection; -1 once its sign was mapped."""
+    sign_shift: Int[Tensor, " d"]
+    lane_label: Int[Tensor, " l"]
+    road: RoadEstimate
+
+
+@dataclass(frozen=True)
 class _Promise:
     """What a stretch showed, mapped when it is due."""
 
@@ -85,24 +95,20 @@ class SingleJourneyMapper:
             config = replace(config, road=replace(config.road, method="causal"))
         self.config = config
         self.rig = rig
-        self._signs = SignAssociator(config.sign_association)
+        self._signs = SignAssociator(config.positioning, config.sign_association)
         self._lanes = LaneAssociator(config.lane_association)
-        self._road = RoadTracker(rig, config.road)
+        self._road = RoadTracker(rig, config.positioning, config.road)
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         self._promised: list[_Promise] = []
         self._next = 0
-        self._parts: list[Journey] = []
-        self._sign_labels: list[Tensor] = []
-        self._sign_shifts: list[Tensor] = []
-        self._lane_labels: list[Tensor] = []
-        self._roads: list[RoadEstimate] = []
+        self._held: list[_HeldFrame] = []
         self._mapped_lanes = 0
         _load_derivatives(rig)
 
     @property
     def frames_held(self) -> int:
         """Frames in memory: those since the oldest landmark that is still in sight came up."""
-        return len(self._parts)
+        return len(self._held)
 
     @torch.no_grad()
     def step(self, frame: Journey) -> StepResult:
@@ -114,11 +120,7 @@ class SingleJourneyMapper:
         sign_label, sign_shift = self._signs.step(number, pose, frame.signs)
         lane_label = self._lanes.step(number, pose, frame.lanes, frame.lane_points, frame.rig)
         road = self._road.advance(frame)
-        self._parts.append(frame)
-        self._sign_labels.append(sign_label)
-        self._sign_shifts.append(sign_shift)
-        self._lane_labels.append(lane_label)
-        self._roads.append(road)
+        self._held.append(_HeldFrame(frame, sign_label, sign_shift, lane_label, road))
         if self._next % SIGN_STRETCH_FRAMES == 0:
             self._map_signs(self._ended_signs())
         if self._next - self._mapped_lanes >= LANE_STRETCH_FRAMES:
@@ -135,8 +137,7 @@ class SingleJourneyMapper:
         self._map_signs(self._held_signs())
         self._map_lanes()
         signs, lanes = _collected(self._promised)
-        self._parts, self._sign_labels, self._sign_shifts = [], [], []
-        self._lane_labels, self._roads, self._promised = [], [], []
+        self._held, self._promised = [], []
         return signs, lanes
 
     def state_dict(self) -> dict[str, object]:
@@ -146,13 +147,7 @@ class SingleJourneyMapper:
             "lanes": self._lanes.state_dict(),
             "road": copy.deepcopy(self._road),
             "next": self._next,
-            "held": (
-                list(self._parts),
-                list(self._sign_labels),
-                list(self._sign_shifts),
-                list(self._lane_labels),
-                list(self._roads),
-            ),
+            "held": list(self._held),
             "mapped_lanes": self._mapped_lanes,
             "promised": [(p.due, p.result()) for p in self._promised],
         }
@@ -163,21 +158,20 @@ class SingleJourneyMapper:
         self._lanes.load_state_dict(state["lanes"])
         self._road = copy.deepcopy(state["road"])
         self._next = state["next"]
-        parts, labels, shifts, lane_labels, roads = (list(held) for held in state["held"])
-        self._parts, self._sign_labels, self._sign_shifts = parts, labels, shifts
-        self._lane_labels, self._roads = lane_labels, roads
+        self._held = list(state["held"])
         self._mapped_lanes = state["mapped_lanes"]
         self._promised = [_Promise(due, lambda made=made: made) for due, made in state["promised"]]
 
     def _held_signs(self) -> Int[Tensor, " n"]:
         """Tracklets of signs that were not mapped yet."""
-        label = torch.cat([torch.zeros(0, dtype=torch.int64), *self._sign_labels]).unique()
+        none = torch.zeros(0, dtype=torch.int64)
+        label = torch.cat([none, *(held.sign_label for held in self._held)]).unique()
         return label[label >= 0]
 
     def _ended_signs(self) -> Int[Tensor, " n"]:
         """Those of them that cannot be continued any more."""
         window = self.config.sign_association.window_frames
-        recent = torch.cat(self._sign_labels[-window - 1 :])
+        recent = torch.cat([held.sign_label for held in self._held[-window - 1 :]])
         held = self._held_signs()
         return held[~torch.isin(held, recent)]
 
@@ -185,38 +179,41 @@ class SingleJourneyMapper:
         """Has the signs of tracklets mapped; a sign is mapped once, so their detections are taken off."""
         if not len(wanted):
             return
-        label, shift = torch.cat(self._sign_labels), torch.cat(self._sign_shifts)
+        label = torch.cat([held.sign_label for held in self._held])
+        shift = torch.cat([held.sign_shift for held in self._held])
         is_wanted = torch.isin(label, wanted)
         own = torch.where(is_wanted, torch.searchsorted(wanted, label), -1)
-        self._sign_labels = list(
-            torch.where(is_wanted, -1, label).split([len(part) for part in self._sign_labels])
-        )
-        tracklets, parts = Tracklets(own, len(wanted), shift), list(self._parts)
+        config, tracklets = self.config, Tracklets(own, len(wanted), shift)
+        parts = [held.part for held in self._held]
         first = self._next - len(parts)
+        left = label.masked_fill(is_wanted, -1).split([len(h.sign_label) for h in self._held])
+        self._held = [
+            replace(held, sign_label=rest) for held, rest in zip(self._held, left, strict=True)
+        ]
 
         def mapped() -> Signs:
-            signs, _ = triangulate_signs(joined(parts), tracklets, self.config.sign_triangulation)
+            signs, _ = triangulate_signs(
+                joined(parts), tracklets, config.positioning, config.sign_triangulation
+            )
             return replace(signs, frame=signs.frame + first, tracklet=wanted[signs.tracklet])
 
         self._promise(mapped)
 
     def _map_lanes(self) -> None:
         """Has the lanes of the last stretch mapped."""
-        first = self._next - len(self._parts)
-        # Half a stretch of overlap, so that pieces meet.
-        start = max(self._mapped_lanes - LANE_STRETCH_FRAMES // 2 - first, 0)
+        start = self._stretch_start()
         self._mapped_lanes = self._next
-        parts, roads = self._parts[start:], self._roads[start:]
-        if not parts:
+        stretch = self._held[start:]
+        if not stretch:
             return
-        used, own = torch.unique(torch.cat(self._lane_labels[start:]), return_inverse=True)
+        first = self._next - len(stretch)
+        label = torch.cat([held.lane_label for held in stretch])
+        used, own = torch.unique(label, return_inverse=True)
 
         def mapped() -> Lanes:
-            tracklets = Tracklets(own, len(used))
-            lanes, _ = reconstruct_lanes(
-                joined(parts), tracklets, concatenate(roads), self.config.lane
-            )
-            return replace(lanes, frame=lanes.frame + first + start, tracklet=used[lanes.tracklet])
+            part, road = joined([h.part for h in stretch]), concatenate([h.road for h in stretch])
+            lanes, _ = reconstruct_lanes(part, Tracklets(own, len(used)), road, self.config.lane)
+            return replace(lanes, frame=lanes.frame + first, tracklet=used[lanes.tracklet])
 
         self._promise(mapped)
 
@@ -224,24 +221,16 @@ class SingleJourneyMapper:
         result = self._beside.submit(mapped).result
         self._promised.append(_Promise(self._next + MAPPING_FRAMES, result))
 
+    def _stretch_start(self) -> int:
+        """The held frame with which the lanes' stretch starts: half a stretch of overlap, so that pieces meet."""
+        first = self._next - len(self._held)
+        return max(self._mapped_lanes - LANE_STRETCH_FRAMES // 2 - first, 0)
+
     def _forget(self) -> None:
         """Drops the frames that nothing in sight and no unfinished stretch needs."""
-        needed = len(self._parts)
-        for index, labels in enumerate(self._sign_labels):
-            if bool((labels >= 0).any()):
-                needed = index
-                break
-        first = self._next - len(self._parts)
-        stretch = max(self._mapped_lanes - LANE_STRETCH_FRAMES // 2 - first, 0)
-        drop = max(min(needed, stretch), len(self._parts) - MAX_OPEN_FRAMES, 0)
-        for held in (
-            self._parts,
-            self._sign_labels,
-            self._sign_shifts,
-            self._lane_labels,
-            self._roads,
-        ):
-            del held[:drop]
+        in_sight = (i for i, held in enumerate(self._held) if bool((held.sign_label >= 0).any()))
+        needed = min(next(in_sight, len(self._held)), self._stretch_start())
+        del self._held[: max(needed, len(self._held) - MAX_OPEN_FRAMES)]
 
 
 def _load_derivatives(rig: Rig) -> None:
@@ -256,10 +245,7 @@ def _collected(promises: list[_Promise]) -> tuple[Signs | None, Lanes | None]:
     made = [promise.result() for promise in promises]
     signs = [one for one in made if isinstance(one, Signs)]
     lanes = [one for one in made if isinstance(one, Lanes)]
-    return (
-        concatenate(signs) if signs else None,
-        concatenate_lanes(lanes) if lanes else None,
-    )
+    return (concatenate(signs) if signs else None, concatenate_lanes(lanes) if lanes else None)
 
 
 def frame_of(journey: Journey, index: int) -> Journey:
@@ -287,16 +273,16 @@ def frame_of(journey: Journey, index: int) -> Journey:
 
 def joined(parts: list[Journey]) -> Journey:
     """Successive parts of one journey as one."""
-    frames = torch.tensor([p.frame_count for p in parts])
-    frame_offset = (frames.cumsum(0) - frames).tolist()
-    lanes = torch.tensor([len(p.lanes) for p in parts])
-    lane_offset = (lanes.cumsum(0) - lanes).tolist()
     every_sigma = [p.sigma_position for p in parts if p.sigma_position is not None]
     every_turn = [p.sigma_rotation for p in parts if p.sigma_rotation is not None]
-
-    def shifted(table: SignDetections | LaneDetections, offset: int):
-        return replace(table, frame=table.frame + offset)
-
+    signs, lanes, points = [], [], []
+    frames = lane_rows = 0
+    for p in parts:
+        signs.append(replace(p.signs, frame=p.signs.frame + frames))
+        lanes.append(replace(p.lanes, frame=p.lanes.frame + frames))
+        points.append(replace(p.lane_points, detection=p.lane_points.detection + lane_rows))
+        frames += p.frame_count
+        lane_rows += len(p.lanes)
     return replace(
         parts[0],
         frame_number=torch.cat([p.frame_number for p in parts]),
@@ -304,16 +290,7 @@ def joined(parts: list[Journey]) -> Journey:
         T_world_camera=torch.cat([p.T_world_camera for p in parts]),
         sigma_position=torch.cat(every_sigma) if len(every_sigma) == len(parts) else None,
         sigma_rotation=torch.cat(every_turn) if len(every_turn) == len(parts) else None,
-        signs=concatenate(
-            [shifted(p.signs, at) for p, at in zip(parts, frame_offset, strict=True)]
-        ),
-        lanes=concatenate(
-            [shifted(p.lanes, at) for p, at in zip(parts, frame_offset, strict=True)]
-        ),
-        lane_points=concatenate(
-            [
-                replace(p.lane_points, detection=p.lane_points.detection + at)
-                for p, at in zip(parts, lane_offset, strict=True)
-            ]
-        ),
+        signs=concatenate(signs),
+        lanes=concatenate(lanes),
+        lane_points=concatenate(points),
     )

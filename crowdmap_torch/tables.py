@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.geometry import polygon, se3
+from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.geometry.camera import Camera
 
 LANE_TYPES = ("solid", "dashed", "double", "curb")
@@ -241,19 +241,15 @@ class Lanes(Rows):
     def select(self, index: Tensor) -> Lanes:
         """The pieces at `index` with their control points packed in that order."""
         pieces = self[index]
-        start = pieces.control_count.cumsum(0) - pieces.control_count
-        piece_of = torch.repeat_interleave(
-            torch.arange(len(pieces), device=start.device), pieces.control_count
-        )
-        rank = torch.arange(len(piece_of), device=start.device) - start[piece_of]
+        piece_of, rank = spline_basis.rows(pieces.control_count)
         control = self.control[pieces.control_start[piece_of] + rank]
+        start = spline_basis.starts(pieces.control_count)
         return replace(pieces, control_start=start, control=control)
 
     @property
     def piece_of_control(self) -> Int[Tensor, " c"]:
         """The piece each control point belongs to; control points must be packed in the order of the pieces."""
-        rows = torch.arange(len(self), device=self.control_count.device)
-        return torch.repeat_interleave(rows, self.control_count)
+        return spline_basis.rows(self.control_count)[0]
 
 
 @dataclass(frozen=True)

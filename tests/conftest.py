@@ -12,6 +12,8 @@ import torch
 from jaxtyping import install_import_hook
 
 if TYPE_CHECKING:
+    from worlds.small_world import Builder
+
     from crowdmap_torch.io.truth import Truth
     from crowdmap_torch.mapper import MapResult
     from crowdmap_torch.tables import Dataset, Survey
@@ -21,7 +23,7 @@ if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)
 
 if os.environ.get("CROWDMAP_CHECK_SHAPES"):
-    # Every jaxtyping annotation of the package is checked at run time: slower, and worth a run now and then.
+    # Every jaxtyping annotation of the package is checked at run time, as in `make test`.
     install_import_hook("crowdmap_torch", "shape_checks.checked")
 
 ROOT = Path(__file__).parent.parent
@@ -55,9 +57,24 @@ def generator() -> torch.Generator:
 
 
 @pytest.fixture(scope="session")
+def build() -> Builder:
+    """What makes tables from a few numbers."""
+    from worlds.small_world import Builder
+
+    return Builder()
+
+
+@pytest.fixture
+def row_of_signs() -> torch.Tensor:
+    """Centres of twelve signs along a road, 20 m apart, on both sides."""
+    k = torch.arange(12, dtype=torch.float64)
+    return torch.stack((20 * k, 4 * (-1) ** k, 2.5 + 0.1 * k), dim=-1)
+
+
+@pytest.fixture(scope="session")
 def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated dataset of three short journeys on disk; tests that change it copy it first."""
-    from drives import write_tiny
+    from worlds.drives import write_tiny
 
     return write_tiny(tmp_path_factory.mktemp("tiny") / "dataset")
 

@@ -51,7 +51,7 @@ def test_a_file_changes_what_it_names_and_nothing_else(load):
         ("[1, 2]", ["expected keys and values"]),
         ("lane_association: {reach_m: 2.0}", ["reach_m", "expected a list", "2.0"]),
         ("lane_association: {reach_m: [2.0]}", ["reach_m", "expected 2 values, found 1"]),
-        ("adjust: {prior: {bias_sigma_m: [1, 1, 1, 1]}}", ["bias_sigma_m", "expected 3 values"]),
+        ("positioning: {bias_sigma_m: [1, 1, 1, 1]}", ["bias_sigma_m", "expected 3 values"]),
         ("lane_association: {reach_m: [2.0, far]}", ["reach_m[1]", "expected float", "'far'"]),
         ("method: best", ["method", "joint", "paper2017", "'best'"]),
         ("crowd: {method: best}", ["crowd", "method", "'best'"]),

@@ -1,125 +1,83 @@
-"""Imports go down only (ARCHITECTURE.md): read from the source, nothing is imported."""
+"""The house of docs/ARCHITECTURE.md: imports go down only, read from the source; the page shows them as they are."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
-from functools import cache
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
+import architecture
 import pytest
+from architecture import FLOOR, NEIGHBOURS, functions, imports, modules, own_imports, room, tree
 
-ROOT = Path(__file__).parent.parent
-PACKAGE = "crowdmap_torch"
-LEVELS = {
-    "geometry": 0,
-    "optim": 0,
-    "clustering": 0,
-    "tables": 1,
-    "io": 2,
-    "residuals": 2,
-    "simulate": 2,
-    "stages": 3,
-    "config": 4,
-    "control": 4,
-    "crowd": 4,
-    "evaluate": 4,
-    "evaluation": 4,
-    "mapper": 4,
-    "report": 5,
-    "run_folder": 5,
-    "single_journey": 4,
-    "run_metrics": 5,
-    "benchmark": 6,
-    "studies": 6,
-    "subcommands": 6,
-    "": 6,
-}
-"""The layer of each module or package; the package's own `__init__` ("") may import all of them."""
-SHARED_LEVEL = 2
-"""The layer of whatever else there is: pieces between the tables and the stages that call them."""
-
-MODULES = sorted((ROOT / PACKAGE).rglob("*.py"))
+PACKAGE = architecture.ROOT / architecture.PACKAGE
+SPEAKING = ("benchmark", "commands", "studies")
+"""Rooms that print: benchmarks and studies are the inside of a command."""
 
 
-def name_of(path: Path) -> str:
-    """The dotted name of a module inside the package, "" for the package itself."""
-    parts = path.relative_to(ROOT / PACKAGE).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+def test_every_module_has_a_floor() -> None:
+    assert {room(name) for name in modules()} == set(FLOOR)
 
 
-NAMES = {name_of(path) for path in MODULES}
+def test_imports_go_down_only() -> None:
+    for name in modules():
+        for other in own_imports(name):
+            above, below = room(name), room(other)
+            if below == above or below in NEIGHBOURS.get(above, ()):
+                continue
+            assert FLOOR[below] < FLOOR[above], (
+                f"{name} (floor {FLOOR[above]}) imports {other} (floor {FLOOR[below]}): imports go down"
+            )
 
 
-def unit(name: str) -> str:
-    return name.split(".")[0]
+def test_neighbours_are_those_that_are_needed() -> None:
+    level = {edge for edge in architecture.arrows() if FLOOR[edge[0]] == FLOOR[edge[1]]}
+    assert level == {(one, other) for one, others in NEIGHBOURS.items() for other in others}
 
 
-def level(name: str) -> int:
-    return LEVELS.get(unit(name), SHARED_LEVEL)
+def test_the_page_shows_the_house_as_it_is() -> None:
+    assert architecture.page_drawing() == architecture.drawing(), (
+        "docs/ARCHITECTURE.md is out of date: run `python docs/architecture.py --write`"
+    )
 
 
-@cache
-def tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+def test_the_root_of_the_package_is_not_a_room() -> None:
+    assert len([*PACKAGE.glob("*.py")]) <= 9
 
 
-def imports(path: Path) -> Iterator[str]:
-    """Full names of what a module imports, wherever in the file that stands."""
-    for node in ast.walk(tree(path)):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import; write it in full"
-            for alias in node.names:
-                yield f"{node.module}.{alias.name}"
+def test_files_are_read_in_one_sitting() -> None:
+    lines = {n: len(path.read_text("utf-8").splitlines()) for n, path in modules().items()}
+    assert not {name: count for name, count in lines.items() if count > 450}
 
 
-def own_imports(path: Path) -> set[str]:
-    """Modules of the package that a module imports."""
-    found = set()
-    for full in imports(path):
-        if full != PACKAGE and not full.startswith(f"{PACKAGE}."):
-            continue
-        if full == f"{PACKAGE}.__version__":
-            # A constant, the first thing in the package's `__init__`.
-            continue
-        name = full.removeprefix(PACKAGE).removeprefix(".")
-        # The last part may be something inside the module.
-        found.add(name if name in NAMES else name.rpartition(".")[0])
-    return found - {name_of(path)}
+def test_functions_fit_on_a_page() -> None:
+    long = {
+        f"{name}.{function}": lines
+        for name, path in modules().items()
+        for function, lines in functions(path)
+        if lines > 80
+    }
+    assert not long
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_imports_go_down_only(path: Path) -> None:
-    name = name_of(path)
-    for other in own_imports(path):
-        if unit(other) == unit(name):
-            continue
-        if level(name) == 0:
-            pytest.fail(f"{name} (L0) imports {other}: packages of L0 know nothing but themselves")
-        assert level(other) <= level(name), (
-            f"{name} (L{level(name)}) imports {other} (L{level(other)}): imports go down only"
-        )
+def test_a_sign_passes_few_modules_from_file_to_map() -> None:
+    way = architecture.sign_way()
+    assert len(way) <= 15
+    # From the detections' file, through one journey, many journeys and the adjustment, to the map's file.
+    stations = ("io.detections", "tracking.signs", "signs.triangulate", "crowd_signs.register")
+    places = [way.index(name) for name in (*stations, "adjustment.adjust", "io.maps")]
+    assert places == sorted(places)
 
 
 def test_modules_do_not_import_in_circles() -> None:
-    graph = {name_of(path): own_imports(path) for path in MODULES}
+    graph = {name: own_imports(name) for name in modules()}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(f"import cycle: {' -> '.join(error.args[1])}")
 
 
-def test_stages_never_import_each_other() -> None:
-    for path in (p for p in MODULES if p.parent.name == "stages"):
-        others = {name for name in own_imports(path) if unit(name) == "stages"}
-        assert not others, f"{name_of(path)} imports {sorted(others)}: what two stages need is L2"
-
-
 def test_nothing_imports_scripts_or_tests() -> None:
-    for path in MODULES:
+    for path in modules().values():
         roots = {full.split(".")[0] for full in imports(path)}
         assert not roots & {"scripts", "tests"}, path
 
@@ -130,21 +88,20 @@ def test_nothing_imports_scripts_or_tests() -> None:
         ("kornia.geometry.camera", "geometry.camera"),
         ("kornia.geometry.calibration", "geometry.camera"),
         ("pytorch_kinematics", "geometry.rig"),
-        ("pyproj", "geometry.geodesy"),
+        ("cv2", "road.calibration"),
     ],
 )
 def test_a_library_is_imported_in_one_place(library: str, only: str) -> None:
     places = {
-        name_of(path)
-        for path in MODULES
+        name
+        for name, path in modules().items()
         if any(full == library or full.startswith(f"{library}.") for full in imports(path))
     }
     assert places <= {only}
 
 
 def test_the_library_does_not_print() -> None:
-    # Benchmarks and studies print tables: they are the inside of a script.
-    for path in (p for p in MODULES if unit(name_of(p)) not in ("benchmark", "studies")):
+    for path in (p for name, p in modules().items() if room(name) not in SPEAKING):
         calls = (n.func for n in ast.walk(tree(path)) if isinstance(n, ast.Call))
         prints = [f.lineno for f in calls if isinstance(f, ast.Name) and f.id == "print"]
         assert not prints, f"{path}: print in lines {prints}; return numbers, report/ shows them"
@@ -152,11 +109,11 @@ def test_the_library_does_not_print() -> None:
 
 def test_no_module_is_a_drawer_for_the_rest() -> None:
     drawers = {"utils", "util", "common", "helpers", "helper", "misc"}
-    assert not {name for name in NAMES if drawers & set(name.split("."))}
+    assert not {name for name in modules() if drawers & set(name.split("."))}
 
 
 def test_no_exception_is_caught_whatever_it_is() -> None:
-    for path in MODULES:
+    for path in modules().values():
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.ExceptHandler):
                 caught = ast.unparse(node.type) if node.type else "everything"

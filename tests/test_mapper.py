@@ -7,15 +7,16 @@ from typing import Any
 
 import pytest
 import torch
-from drives import shuffled, turn_about_up, with_frames
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
+from worlds.drives import shuffled, turn_about_up, with_frames
 
 from crowdmap_torch.config import MapperConfig
-from crowdmap_torch.geometry import se3, spline
+from crowdmap_torch.geometry import se3, spline_length
 from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.surveys import read_survey
-from crowdmap_torch.mapper import MapResult, build_map, certain_part, map_journeys
+from crowdmap_torch.mapper import MapResult, build_map, map_journeys
 from crowdmap_torch.tables import Dataset, HdMap, Journey
 
 CONFIG = MapperConfig()
@@ -45,7 +46,7 @@ def largest_corner_distance(a: HdMap, b: HdMap) -> float:
 def lane_distance(a: HdMap, b: HdMap) -> float:
     """From the points of each map's lanes to the other's, for 95 % of them: a lane may end a metre earlier."""
     one, other = (
-        spline.sample_flat(m.lanes.control.point_world, m.lanes.control_count, 0.05)[0]
+        spline_length.sample_flat(m.lanes.control.point_world, m.lanes.control_count, 0.05)[0]
         for m in (a, b)
     )
     distance = torch.cdist(one, other)

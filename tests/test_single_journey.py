@@ -9,8 +9,11 @@ import torch
 
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.datasets import load_journey
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.road.estimate import estimate_road
+from crowdmap_torch.signs.triangulate import triangulate_signs
 from crowdmap_torch.simulate.dataset import SimulationConfig, write_dataset
-from crowdmap_torch.simulate.worlds import PRESETS
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS
 from crowdmap_torch.single_journey import (
     LANE_STRETCH_FRAMES,
     MAPPING_FRAMES,
@@ -19,11 +22,9 @@ from crowdmap_torch.single_journey import (
     frame_of,
     joined,
 )
-from crowdmap_torch.stages.associate import associate_signs
-from crowdmap_torch.stages.associate_lanes import associate_lanes
-from crowdmap_torch.stages.road import estimate_road
-from crowdmap_torch.stages.signs import triangulate_signs
 from crowdmap_torch.tables import concatenate
+from crowdmap_torch.tracking.lanes import associate_lanes
+from crowdmap_torch.tracking.signs import associate_signs
 
 FRAMES = 220
 
@@ -32,7 +33,7 @@ FRAMES = 220
 def drive(tmp_path_factory):
     """The first frames of a simulated street."""
     out = tmp_path_factory.mktemp("drive") / "street"
-    config = SimulationConfig(world=PRESETS["street"], journeys=1, seed=3)
+    config = SimulationConfig(world=WORLD_PRESETS["street"], journeys=1, seed=3)
     write_dataset(config, out)
     (folder,) = (out / "journeys").iterdir()
     journey, _ = load_journey(folder)
@@ -52,7 +53,7 @@ def stepped(drive):
 def test_association_equals_the_batch(drive, stepped):
     results, _, _ = stepped
     config = MapperConfig()
-    signs = associate_signs(drive, config.sign_association)
+    signs = associate_signs(drive, config.positioning, config.sign_association)
     order = torch.argsort(drive.signs.frame, stable=True)
     assert torch.equal(torch.cat([r.sign_tracklet for r in results]), signs.label[order])
     lanes = associate_lanes(drive, config.lane_association)
@@ -63,7 +64,7 @@ def test_association_equals_the_batch(drive, stepped):
 def test_the_road_equals_the_causal_batch(drive, stepped):
     results, _, _ = stepped
     config = replace(MapperConfig().road, method="causal")
-    batch = estimate_road(drive, config)
+    batch = estimate_road(drive, PositioningNoise(), config)
     stepwise = concatenate([r.road for r in results])
     torch.testing.assert_close(stepwise.normal_camera, batch.normal_camera, rtol=0, atol=1e-9)
 
@@ -72,7 +73,10 @@ def test_every_sign_of_the_batch_comes_out_once(drive, stepped):
     results, (last, _), _ = stepped
     config = MapperConfig()
     batch, _ = triangulate_signs(
-        drive, associate_signs(drive, config.sign_association), config.sign_triangulation
+        drive,
+        associate_signs(drive, config.positioning, config.sign_association),
+        config.positioning,
+        config.sign_triangulation,
     )
     found = [r.signs for r in results if r.signs is not None]
     found = concatenate(found + ([last] if last is not None else []))
@@ -93,7 +97,10 @@ def test_a_drive_that_ends_early_is_the_batch(drive):
     found, _ = mapper.finish()
     part, config = joined(frames), MapperConfig()
     batch, _ = triangulate_signs(
-        part, associate_signs(part, config.sign_association), config.sign_triangulation
+        part,
+        associate_signs(part, config.positioning, config.sign_association),
+        config.positioning,
+        config.sign_triangulation,
     )
     assert found is not None and len(found) == len(batch) > 0
     torch.testing.assert_close(found.T_world_sign, batch.T_world_sign, rtol=0, atol=1e-6)

@@ -1,1 +1,1 @@
-"""Times and figures beside other ways to do the same; run by scripts/benchmark.py."""
+"""Times and figures beside other ways to do the same; run by `crowdmap benchmark`."""

@@ -10,11 +10,14 @@ from pathlib import Path
 import torch
 
 from crowdmap_torch.config import METHODS, MapperConfig
-from crowdmap_torch.evaluate import MapFigures, evaluate_map
+from crowdmap_torch.evaluation.evaluate import evaluate_map
+from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.truth import SignAssociations
-from crowdmap_torch.mapper import build_map, certain_part
-from crowdmap_torch.run_folder import read_survey_of, read_truth_of
+from crowdmap_torch.mapper import build_map
+from crowdmap_torch.runs.folder import read_survey_of, read_truth_of
 from crowdmap_torch.tables import Association, Dataset
 
 
@@ -48,12 +51,12 @@ COLUMNS = (
 def compare(
     dataset_folder: Path, methods: Sequence[str] = METHODS, *, workers: int = 1
 ) -> dict[str, Compared]:
-    """Figures of the map that each method makes of a simulated dataset; ValueError if its truth is missing."""
+    """Figures of the map that each method makes of a simulated dataset; InputError if its truth is missing."""
     dataset = load_dataset(dataset_folder)
     survey = read_survey_of(dataset_folder, dataset.origin)
     truth = read_truth_of(dataset_folder, dataset, survey)
     if survey is None or truth is None:
-        raise ValueError(f"{dataset_folder}: expected a simulated dataset with survey/truth")
+        raise InputError(f"{dataset_folder}: expected a simulated dataset with survey/truth")
     figures = {}
     for method in methods:
         config = replace(MapperConfig(), method=method)

@@ -1,4 +1,4 @@
-"""Bundle adjustment against Ceres and GTSAM on one objective: `benchmark.py bundle`.
+"""Bundle adjustment against Ceres and GTSAM on one objective: `crowdmap benchmark bundle`.
 
 Every solver runs in a process of its own, in turns; the cost at its result is computed by one neutral function.
 `--problem FILE.npz --out OUT.npz` solves one problem with ours and prints one JSON line.
@@ -25,30 +25,26 @@ import torch
 
 from crowdmap_torch.benchmark import free_corners
 from crowdmap_torch.benchmark.free_corners import FreeCorners
+from crowdmap_torch.benchmark.kept_matrix import KeptMatrixConfig, minimise
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.optim import levenberg_marquardt as lm
-from crowdmap_torch.optim.chain import ChainBackend
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.robust import Huber, Tukey
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
 
-LM = lm.LmConfig(
-    max_iterations=100, cost_tolerance=1e-6, initial_damping=1e-8, max_stretch=3.0, reuse_below=5e-3
+MINIMISATION = KeptMatrixConfig(
+    lm.LmConfig(max_iterations=100, cost_tolerance=1e-6, initial_damping=1e-8, max_stretch=3.0)
 )
 """Both stages stop when a step lowers the cost by less than a millionth, as the peers do."""
 PEERS = {"ceres": "peers/ceres.py", "gtsam": "peers/gtsam.py"}
-SERIES = (
-    (5, 100, 10),
-    (5, 500, 31),
-    (25, 500, 31),
-    (100, 500, 31),
-    (400, 500, 31),
-    (25, 500, 200),
-)
+SERIES = ((5, 100, 10), (5, 500, 31), (25, 500, 31), (100, 500, 31), (400, 500, 31), (25, 500, 200))
 """Journeys, frames of each and signs of the problems of the table."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `benchmark.py bundle`."""
+    """The options of `crowdmap benchmark bundle`."""
     parser.add_argument("--problem", type=Path, help="solve this problem alone, with ours")
     parser.add_argument("--out", type=Path, help="npz file of its result: q, p, X")
     parser.add_argument("--device", default="cpu")
@@ -82,7 +78,7 @@ def solve_file(problem: Path, out: Path | None, device: torch.device) -> dict[st
     """Solves a problem file; writes q, p and X, and gives times, steps and memory."""
     given = free_corners.load(problem)
     if out is not None and not out.parent.is_dir():
-        raise ValueError(f"{out}: the folder {out.parent} does not exist")
+        raise InputError(f"{out}: the folder {out.parent} does not exist")
     figures, q, p, X = solve(given, device)
     if out is not None:
         beside = out.with_name(f".{out.name}.tmp.npz")
@@ -111,7 +107,7 @@ def solve(
         "setup_s": ready - start,
         "solve_s": done - ready,
         "iterations": first.iterations + last.iterations,
-        "peak_gb": _peak_gb(),
+        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
         "cost": free_corners.cost(problem, q, p, X),
         "reason": last.reasons[0],
     }
@@ -124,7 +120,7 @@ def _prepared(problem: FreeCorners, device: torch.device) -> tuple[Problem, Valu
     """The problem of the first stage, its start, and the back end with the structure worked out."""
     built, values = free_corners.bundle(problem, Huber(problem.huber_c), device)
     chain = torch.arange(problem.J, device=device).repeat_interleave(problem.F)
-    backend = ChainBackend("pose", chain)
+    backend = ChainBackend(EliminationPlan("pose", chain))
     backend.prepare(built, values)
     return built, values, backend
 
@@ -133,19 +129,15 @@ def _minimise(
     problem: FreeCorners, built: Problem, values: Values, backend: ChainBackend
 ) -> tuple[lm.LmState, lm.LmState]:
     """The states at the end of both stages."""
-    first = lm.solve(built, values, LM, backend=backend)
+    first = minimise(built, values, MINIMISATION, backend)
     corner = replace(built.terms["corner"], loss=Tukey(problem.tukey_c))
     built = replace(built, terms={**built.terms, "corner": corner})
-    return first, lm.solve(built, first.values, LM, backend=backend)
+    return first, minimise(built, first.values, MINIMISATION, backend)
 
 
 def _synchronise(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-def _peak_gb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 def growth(medians: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Iterator[str]:
@@ -178,7 +170,7 @@ def _parsed(size: str) -> tuple[int, int, int]:
     try:
         journeys, frames, signs = (int(part) for part in size.split("x"))
     except ValueError:
-        raise ValueError(f"--sizes: expected JOURNEYSxFRAMESxSIGNS, found {size!r}") from None
+        raise InputError(f"--sizes: expected JOURNEYSxFRAMESxSIGNS, found {size!r}") from None
     return journeys, frames, signs
 
 
@@ -230,9 +222,9 @@ def _fresh(name: str, problem: Path, out: Path, options: argparse.Namespace) -> 
     """The figures that a solver prints in a process of its own."""
     threads = str(options.threads)
     if name == "ours":
-        script = Path(sys.argv[0])
-        command = [sys.executable, str(script), "bundle", "--problem", str(problem)]
-        command += ["--out", str(out), "--threads", threads, "--device", options.device]
+        command = [sys.executable, "-m", "crowdmap_torch", "benchmark", "bundle"]
+        command += ["--problem", str(problem), "--out", str(out)]
+        command += ["--threads", threads, "--device", options.device]
     else:
         command = [sys.executable, str(Path(__file__).parent / PEERS[name])]
         command += [str(problem), str(out), threads]

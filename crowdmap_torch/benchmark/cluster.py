@@ -25,9 +25,10 @@ from sklearn.cluster import HDBSCAN, SpectralClustering
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import pairs_within
-from crowdmap_torch.crowd import CrowdConfig, associate_crowd
-from crowdmap_torch.crowd_signs import CrowdSigns
+from crowdmap_torch.crowd_signs.gather import CrowdSigns
+from crowdmap_torch.crowd_signs.register import CrowdConfig, register_crowd
 from crowdmap_torch.geometry import polygon, se3
+from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.tables import Signs
 
 THREADS = 2
@@ -115,7 +116,7 @@ def make_street(triangulations: int, *, seed: int) -> Street:
 
 def ours(street: Street) -> Int[Tensor, " n"]:
     """Clusters and biases found together."""
-    return associate_crowd(street.crowd, CrowdConfig()).label
+    return register_crowd(street.crowd, PositioningNoise(), CrowdConfig()).label
 
 
 def spectral(street: Street) -> Int[Tensor, " n"]:

@@ -22,12 +22,18 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crowdmap_torch import residual_blocks, residuals
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
 from crowdmap_torch.optim.robust import Loss
+from crowdmap_torch.residuals import pose as residuals
+from crowdmap_torch.residuals import reprojection
 
 Array = NDArray[Any]
+
+
+_SPACING_M = 2.0
+"""Way between two frames [m]."""
 
 
 @dataclass(frozen=True)
@@ -74,75 +80,27 @@ def load(path: Path) -> FreeCorners:
         with np.load(path) as arrays:
             given = {f.name: arrays[f.name] for f in fields(FreeCorners)}
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: expected an npz file of arrays: {error}") from None
+        raise InputError(f"{path}: expected an npz file of arrays: {error}") from None
     except KeyError as error:
-        raise ValueError(f"{path}: expected an array named {error.args[0]}") from None
+        raise InputError(f"{path}: expected an array named {error.args[0]}") from None
     return FreeCorners(**{k: v.item() if v.ndim == 0 else v for k, v in given.items()})
 
 
 def simulate(journeys: int, frames: int, signs: int, seed: int = 0) -> FreeCorners:
     """Drives along one winding road, a frame every two metres, past signs on both sides."""
     rng = np.random.default_rng([seed, journeys, frames, signs])
-    spacing = 2.0
-    length = spacing * frames
-    station = np.arange(-20.0, length + 90, 0.1)
-    heading = 0.35 * np.sin(station / 110) + 0.12 * np.sin(station / 37)
-    x, y = np.cumsum(np.cos(heading)) * 0.1, np.cumsum(np.sin(heading)) * 0.1
-
-    def on_road(s: Array, aside: Array) -> tuple[Array, Array]:
-        h = np.interp(s, station, heading)
-        east = np.interp(s, station, x) - np.sin(h) * aside
-        north = np.interp(s, station, y) + np.cos(h) * aside
-        return np.stack((east, north, 3 * np.sin(s / 145)), axis=-1), h
-
-    s = rng.uniform(0, spacing, (journeys, 1)) + spacing * np.arange(frames)
-    p, h = on_road(s, 0.25 * np.sin(s / 24 + rng.uniform(0, 6.28, (journeys, 1))))
-    p[..., 2] += 1.4
-    h = h + 0.01 * np.sin(s / 14)
-    # Camera axes as columns: right, down, forward.
-    none = np.zeros_like(h)
-    right = np.stack((np.sin(h), -np.cos(h), none), axis=-1)
-    ahead = np.stack((np.cos(h), np.sin(h), none), axis=-1)
-    axes = np.stack((right, np.stack((none, none, none - 1), axis=-1), ahead), axis=-1)
-    n = journeys * frames
-    R = Rotation.from_matrix(axes.reshape(n, 3, 3)) * _turns(rng, 0.003, n)
-    p = p.reshape(n, 3)
-
-    where = np.sort(rng.uniform(10, length + 8, signs))
-    centre, facing = on_road(where, rng.choice([-1.0, 1.0], signs) * rng.uniform(2, 8, signs))
-    centre[:, 2] += rng.uniform(2, 5, signs)
-    half = rng.uniform(0.3, 0.45, signs)[:, None, None]
-    aside = np.stack((np.sin(facing), -np.cos(facing), 0 * facing), axis=-1)[:, None]
-    corner = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
-    point = centre[:, None] + half * (corner[:, :1] * aside + corner[:, 1:] * np.array([0, 0, 1.0]))
-    point = point.reshape(-1, 3)
-
-    frame_station = s.reshape(n)
+    length, n = _SPACING_M * frames, journeys * frames
+    road = _winding_road(length)
+    s = rng.uniform(0, _SPACING_M, (journeys, 1)) + _SPACING_M * np.arange(frames)
+    R, p = _drive(road, s, rng)
+    where, point = _plates(road, length, signs, rng)
     K = np.array([1000.0, 1000.0, 640.0, 400.0])
-    seen: list[tuple[Array, Array]] = []
-    for sign in range(signs):
-        near = np.nonzero(np.abs(where[sign] - frame_station - 34) < 26)[0]
-        local = point[4 * sign : 4 * sign + 4][None] - p[near, None]
-        local = np.einsum("nji,ncj->nci", _rows(R, near).as_matrix(), local)
-        px = local[..., :2] / local[..., 2:] * K[:2] + K[2:]
-        inside = (local[..., 2] > 1) & (px > 0).all(-1) & (px < 2 * K[2:]).all(-1)
-        near = near[inside.all(1)]
-        seen.append((near, np.full(len(near), sign)))
-    pose, sign = (np.concatenate(part) for part in zip(*seen, strict=True))
-    order = np.lexsort((sign, pose))
-    obs_pose = np.repeat(pose[order], 4)
-    obs_pt = (4 * sign[order][:, None] + np.arange(4)).ravel()
+    obs_pose, obs_pt = _seen(K, R, p, s.reshape(n), where, point)
     uv = _project(K, R.as_quat(), p, point, obs_pose, obs_pt)
     uv += 0.7 * rng.standard_normal(uv.shape)
     wrong = rng.random(len(uv)) < 0.03
     uv[wrong] += 50 * rng.standard_normal((wrong.sum(), 2))
-
-    keeps = np.exp(-spacing / 100)
-    drift = rng.standard_normal((journeys, frames, 3))
-    for k in range(1, frames):
-        drift[:, k] = keeps * drift[:, k - 1] + np.sqrt(1 - keeps**2) * drift[:, k]
-    bias = rng.standard_normal((journeys, 1, 3)) * [0.5, 0.5, 0.1]
-    error = (bias + drift * [0.2, 0.2, 0.1]).reshape(n, 3)
+    error = _pose_errors(journeys, frames, rng)
     sig_r, odo_r = np.radians(0.3), np.radians(0.02)
     first = (np.arange(journeys)[:, None] * frames + np.arange(frames - 1)).ravel()
     step = _rows(R, first).inv().apply(p[first + 1] - p[first])
@@ -169,6 +127,86 @@ def simulate(journeys: int, frames: int, signs: int, seed: int = 0) -> FreeCorne
         tukey_c=4.685,
         huber_c=1.345,
     )
+
+
+@dataclass(frozen=True)
+class _Road:
+    """The middle of a road, sampled by its stations."""
+
+    station: Array
+    heading: Array
+    x: Array
+    y: Array
+
+    def at(self, s: Array, aside: Array) -> tuple[Array, Array]:
+        """Points beside the stations `s`, positive to the left, and the road's headings there."""
+        h = np.interp(s, self.station, self.heading)
+        east = np.interp(s, self.station, self.x) - np.sin(h) * aside
+        north = np.interp(s, self.station, self.y) + np.cos(h) * aside
+        return np.stack((east, north, 3 * np.sin(s / 145)), axis=-1), h
+
+
+def _winding_road(length: float) -> _Road:
+    station = np.arange(-20.0, length + 90, 0.1)
+    heading = 0.35 * np.sin(station / 110) + 0.12 * np.sin(station / 37)
+    x, y = np.cumsum(np.cos(heading)) * 0.1, np.cumsum(np.sin(heading)) * 0.1
+    return _Road(station, heading, x, y)
+
+
+def _drive(road: _Road, s: Array, rng: np.random.Generator) -> tuple[Rotation, Array]:
+    """True poses of the cameras at the stations `s` of each journey."""
+    p, h = road.at(s, 0.25 * np.sin(s / 24 + rng.uniform(0, 6.28, (len(s), 1))))
+    p[..., 2] += 1.4
+    h = h + 0.01 * np.sin(s / 14)
+    # Camera axes as columns: right, down, forward.
+    none = np.zeros_like(h)
+    right = np.stack((np.sin(h), -np.cos(h), none), axis=-1)
+    ahead = np.stack((np.cos(h), np.sin(h), none), axis=-1)
+    axes = np.stack((right, np.stack((none, none, none - 1), axis=-1), ahead), axis=-1)
+    R = Rotation.from_matrix(axes.reshape(s.size, 3, 3)) * _turns(rng, 0.003, s.size)
+    return R, p.reshape(s.size, 3)
+
+
+def _plates(
+    road: _Road, length: float, signs: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Stations of square signs beside the road, and their corners, four of each."""
+    where = np.sort(rng.uniform(10, length + 8, signs))
+    centre, facing = road.at(where, rng.choice([-1.0, 1.0], signs) * rng.uniform(2, 8, signs))
+    centre[:, 2] += rng.uniform(2, 5, signs)
+    half = rng.uniform(0.3, 0.45, signs)[:, None, None]
+    aside = np.stack((np.sin(facing), -np.cos(facing), 0 * facing), axis=-1)[:, None]
+    corner = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+    point = centre[:, None] + half * (corner[:, :1] * aside + corner[:, 1:] * np.array([0, 0, 1.0]))
+    return where, point.reshape(-1, 3)
+
+
+def _seen(
+    K: Array, R: Rotation, p: Array, frame_station: Array, where: Array, point: Array
+) -> tuple[Array, Array]:
+    """Pose and point of every corner of the signs that are wholly in the image, 8 to 60 m ahead."""
+    seen: list[tuple[Array, Array]] = []
+    for sign in range(len(where)):
+        near = np.nonzero(np.abs(where[sign] - frame_station - 34) < 26)[0]
+        local = point[4 * sign : 4 * sign + 4][None] - p[near, None]
+        local = np.einsum("nji,ncj->nci", _rows(R, near).as_matrix(), local)
+        px = local[..., :2] / local[..., 2:] * K[:2] + K[2:]
+        inside = (local[..., 2] > 1) & (px > 0).all(-1) & (px < 2 * K[2:]).all(-1)
+        near = near[inside.all(1)]
+        seen.append((near, np.full(len(near), sign)))
+    pose, sign = (np.concatenate(part) for part in zip(*seen, strict=True))
+    order = np.lexsort((sign, pose))
+    return np.repeat(pose[order], 4), (4 * sign[order][:, None] + np.arange(4)).ravel()
+
+
+def _pose_errors(journeys: int, frames: int, rng: np.random.Generator) -> Array:
+    """What positioning gets wrong of each frame's place: a bias of the journey and a slow drift."""
+    keeps = np.exp(-_SPACING_M / 100)
+    drift = rng.standard_normal((journeys, frames, 3))
+    for k in range(1, frames):
+        drift[:, k] = keeps * drift[:, k - 1] + np.sqrt(1 - keeps**2) * drift[:, k]
+    bias = rng.standard_normal((journeys, 1, 3)) * [0.5, 0.5, 0.1]
+    return (bias + drift * [0.2, 0.2, 0.1]).reshape(journeys * frames, 3)
 
 
 def _turns(rng: np.random.Generator, sigma: float, n: int) -> Rotation:
@@ -225,15 +263,12 @@ def bundle(
     first = tensor(problem.odo_i)
     terms = {
         "corner": CostTerm(
-            residuals.point_reprojection,
+            reprojection.point_reprojection,
             (("pose", tensor(problem.obs_pose)), ("point", tensor(problem.obs_pt))),
             (observation,),
             uv.new_full((len(uv),), 1 / problem.sig_px),
             loss,
-            residuals.point_reprojection_jacobian,
-            residual_blocks.point_reprojection,
-            residual_blocks.point_reprojection_blocks,
-            residual_blocks.point_reprojection_gradient,
+            reprojection.point_reprojection_jacobian,
         ),
         "prior": CostTerm(
             residuals.pose_prior,
@@ -241,9 +276,6 @@ def bundle(
             (prior,),
             weights(problem.sig_prior_t, problem.sig_prior_r, n),
             jacobian=residuals.pose_prior_jacobian,
-            batched=residual_blocks.pose_prior,
-            normal=residual_blocks.pose_prior_blocks,
-            gradient=residual_blocks.pose_prior_gradient,
         ),
         "odometry": CostTerm(
             residuals.relative_pose,
@@ -251,9 +283,6 @@ def bundle(
             (poses(problem.odo_q, problem.odo_p),),
             weights(problem.sig_odo_t, problem.sig_odo_r, len(first)),
             jacobian=residuals.relative_pose_jacobian,
-            batched=residual_blocks.relative_pose,
-            normal=residual_blocks.relative_pose_blocks,
-            gradient=residual_blocks.relative_pose_gradient,
         ),
     }
     variables = {"pose": Variable(6, se3.retract), "point": Variable(3, euclidean)}

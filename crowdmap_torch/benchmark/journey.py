@@ -44,7 +44,7 @@ class StepTimes:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What `benchmark.py journey` takes."""
+    """What `crowdmap benchmark journey` takes."""
     parser.add_argument("dataset", type=Path, help="folder of a dataset")
     parser.add_argument("--journey", type=int, default=0, help="which of its journeys is driven")
     parser.add_argument("--rate", type=float, default=15.0, help="frames a second of the camera")

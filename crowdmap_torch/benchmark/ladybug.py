@@ -1,4 +1,4 @@
-"""Bundle adjustment in the large against Ceres, from one start: `benchmark.py ladybug FILE`.
+"""Bundle adjustment in the large against Ceres, from one start: `crowdmap benchmark ladybug FILE`.
 
 FILE is a problem of Agarwal et al., Bundle Adjustment in the Large (ECCV 2010), as published: nine parameters a camera
 (rotation vector, translation, focal length, two of radial distortion), cameras that look along -z, half a sum of squares
@@ -29,9 +29,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.optim import levenberg_marquardt as lm
-from crowdmap_torch.optim.chain import ChainBackend
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.residuals.reprojection import components
 
 LM = lm.LmConfig(max_iterations=100, cost_tolerance=1e-6, initial_damping=1e-4)
 """As Ceres begins and ends: its first radius is 1e4, and it stops when a step lowers the cost by less than a millionth."""
@@ -58,15 +61,15 @@ def load(path: Path) -> Bal:
     try:
         numbers = np.array(path.read_text().split(), dtype=np.float64)
     except OSError as error:
-        raise ValueError(f"{path}: expected a BAL problem: {error}") from None
+        raise InputError(f"{path}: expected a BAL problem: {error}") from None
     except ValueError as error:
-        raise ValueError(f"{path}: expected numbers alone (is it unpacked?): {error}") from None
+        raise InputError(f"{path}: expected numbers alone (is it unpacked?): {error}") from None
     if len(numbers) < 3:
-        raise ValueError(f"{path}: expected a BAL problem, found {len(numbers)} numbers")
+        raise InputError(f"{path}: expected a BAL problem, found {len(numbers)} numbers")
     cameras, points, rows = (int(count) for count in numbers[:3])
     expected = 3 + 4 * rows + 9 * cameras + 3 * points
     if len(numbers) != expected:
-        raise ValueError(
+        raise InputError(
             f"{path}: {cameras} cameras, {points} points and {rows} observations make "
             f"{expected} numbers, found {len(numbers)}"
         )
@@ -75,51 +78,55 @@ def load(path: Path) -> Bal:
     camera_of, point_of = seen[:, :2].astype(np.int64).T
     for name, index, count in (("camera", camera_of, cameras), ("point", point_of, points)):
         if rows and not 0 <= index.min() <= index.max() < count:
-            raise ValueError(f"{path}: expected a {name} below {count}, found {index.max()}")
+            raise InputError(f"{path}: expected a {name} below {count}, found {index.max()}")
     return Bal(
         camera.reshape(cameras, 9), point.reshape(points, 3), seen[:, 2:], camera_of, point_of
     )
 
 
 def reprojection(
-    camera: Float[Tensor, " 9"], point: Float[Tensor, " 3"], px: Float[Tensor, " 2"]
-) -> Float[Tensor, " 2"]:
+    camera: Float[Tensor, "9 *#rows"],
+    point: Float[Tensor, "3 *#rows"],
+    px: Float[Tensor, "2 *#rows"],
+) -> Float[Tensor, "2 *#rows"]:
     """Pixel error of one point in one camera, as the benchmark defines it: a point behind the camera counts too."""
-    at = se3.so3_exp(camera[:3]) @ point + camera[3:6]
+    R = se3.so3_exp(camera[:3].movedim(0, -1)).movedim((-2, -1), (1, 0))
+    at = components(R, point) + camera[3:6]
     p = -at[:2] / at[2]
-    r2 = p.square().sum()
+    r2 = p.square().sum(0)
     return camera[6] * (1 + r2 * (camera[7] + r2 * camera[8])) * p - px
 
 
 def reprojection_jacobian(
-    camera: Float[Tensor, "m 9"], point: Float[Tensor, "m 3"], px: Float[Tensor, "m 2"]
-) -> tuple[Float[Tensor, "m 2"], tuple[Float[Tensor, "m 2 9"], Float[Tensor, "m 2 3"]]]:
+    camera: Float[Tensor, "9 m"], point: Float[Tensor, "3 m"], px: Float[Tensor, "2 m"]
+) -> tuple[Float[Tensor, "2 m"], tuple[Float[Tensor, "2 9 m"], Float[Tensor, "2 3 m"]]]:
     """`reprojection` of many rows, with its Jacobians in closed form: a seventh of the time of autograd."""
-    w, (f, k1, k2) = camera[:, :3], camera[:, 6:, None].unbind(1)
-    R = se3.so3_exp(w)
-    turned = (R @ point[..., None])[..., 0]
-    at = turned + camera[:, 3:6]
-    inverse = -1 / at[:, 2:]
-    p = at[:, :2] * inverse
-    r2 = p.square().sum(-1, keepdim=True)
+    w, (f, k1, k2) = camera[:3], camera[6:]
+    R = se3.so3_exp(w.mT).permute(1, 2, 0)
+    turned = components(R.transpose(0, 1), point)
+    x, y, z = turned + camera[3:6]
+    p = torch.stack((x, y)) / -z
+    r2 = p.square().sum(0)
     scale = 1 + r2 * (k1 + r2 * k2)
     # By the point before the lens, [I p] / -z, then through the lens.
-    by_p = p[:, :, None] * p[:, None] * (2 * (k1 + 2 * r2 * k2))[..., None]
-    by_p = (by_p + torch.diag_embed(scale.expand(-1, 2))) * (f * inverse)[..., None]
-    by_at = torch.cat((by_p, by_p @ p[..., None]), dim=-1)
+    by_p = p[:, None] * p * (2 * (k1 + 2 * r2 * k2))
+    by_p[(0, 1), (0, 1)] += scale
+    by_p = by_p * (f / -z)
+    by_at = torch.cat((by_p, (by_p * p).sum(1, keepdim=True)), dim=1)
     # Rows times -skew(turned) J_l(w), the left Jacobian of the rotation vector.
-    by_turn = torch.linalg.cross(turned[:, None].expand_as(by_at), by_at)
-    first, second = (c[:, None, None] for c in _left_jacobian(w))
-    axis = w[:, None].expand_as(by_at)
-    once = torch.linalg.cross(axis, by_turn)
-    by_w = by_turn - first * once + second * torch.linalg.cross(axis, once)
-    by_lens = torch.stack((scale * p, f * r2 * p, f * r2 * r2 * p), dim=-1)
-    return f * scale * p - px, (torch.cat((by_w, by_at, by_lens), dim=-1), by_at @ R)
+    by_turn = torch.linalg.cross(turned.expand_as(by_at), by_at, dim=1)
+    first, second = _left_jacobian(w)
+    axis = w.expand_as(by_at)
+    once = torch.linalg.cross(axis, by_turn, dim=1)
+    by_w = by_turn - first * once + second * torch.linalg.cross(axis, once, dim=1)
+    by_lens = torch.stack((scale * p, f * r2 * p, f * r2 * r2 * p), dim=1)
+    by_point = torch.stack([components(R, row) for row in by_at])
+    return f * scale * p - px, (torch.cat((by_w, by_at, by_lens), dim=1), by_point)
 
 
-def _left_jacobian(w: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
+def _left_jacobian(w: Float[Tensor, "3 m"]) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
     """The factors of skew(w) and of its square: (1 - cos t) / t^2 and (t - sin t) / t^3."""
-    theta_sq = w.square().sum(-1)
+    theta_sq = w.square().sum(0)
     # Below this the differences lose more than the series leave out.
     small = theta_sq < 1e-4
     theta = torch.where(small, torch.ones_like(theta_sq), theta_sq).sqrt()
@@ -133,17 +140,15 @@ def bundle(problem: Bal) -> tuple[Problem, dict[str, Tensor], ChainBackend]:
     """The problem, the values to start from, and the back end that eliminates the points."""
     term = CostTerm(
         reprojection,
-        (
-            ("camera", torch.tensor(problem.camera_of)),
-            ("point", torch.tensor(problem.point_of)),
-        ),
+        (("camera", torch.tensor(problem.camera_of)), ("point", torch.tensor(problem.point_of))),
         (torch.tensor(problem.px),),
         jacobian=reprojection_jacobian,
     )
     variables = {"camera": Variable(9, euclidean), "point": Variable(3, euclidean)}
     values = {"camera": torch.tensor(problem.camera), "point": torch.tensor(problem.point)}
     # A point is seen by few cameras: windows that several points share would be mostly zeros.
-    backend = ChainBackend("point", torch.arange(len(problem.point)), group_size=1)
+    plan = EliminationPlan("point", torch.arange(len(problem.point)))
+    backend = ChainBackend(plan, group_size=1)
     return Problem(variables, {"reprojection": term}), values, backend
 
 
@@ -158,7 +163,7 @@ def cost(problem: Bal, camera: Array, point: Array) -> float:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `benchmark.py ladybug`."""
+    """The options of `crowdmap benchmark ladybug`."""
     parser.add_argument("file", type=Path, help="problem as published, unpacked")
     parser.add_argument("--out", type=Path, help="solve with ours alone; npz file of camera, point")
     parser.add_argument("--threads", type=int, default=2)
@@ -183,7 +188,7 @@ def run(options: argparse.Namespace) -> None:
 def solve(problem: Bal, out: Path) -> dict[str, Any]:
     """Solves the problem with ours; writes camera and point, and gives time, steps and memory."""
     if not out.parent.is_dir():
-        raise ValueError(f"{out}: the folder {out.parent} does not exist")
+        raise InputError(f"{out}: the folder {out.parent} does not exist")
     start = time.perf_counter()
     built, values, backend = bundle(problem)
     backend.prepare(built, values)
@@ -214,8 +219,9 @@ def _race(problem: Bal, options: argparse.Namespace) -> None:
         arrays, out = Path(folder) / "problem.npz", Path(folder) / "result.npz"
         np.savez(arrays, **{f.name: getattr(problem, f.name) for f in fields(problem)})
         threads = str(options.threads)
+        ours = ["-m", "crowdmap_torch", "benchmark", "ladybug"]
         commands = {
-            "ours": [sys.argv[0], "ladybug", options.file, "--out", out, "--threads", threads],
+            "ours": [*ours, options.file, "--out", out, "--threads", threads],
             "ceres": [Path(__file__).parent / PEER, arrays, out, threads],
         }
         limits = {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads}

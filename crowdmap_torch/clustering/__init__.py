@@ -1,1 +1,1 @@
-"""Clustering of observations and landmarks."""
+"""Graph clustering, matching, votes and figures of groups of rows (V-A)."""

@@ -8,26 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy import sparse
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 
 def gated_matching(
-    cost: Float[Tensor, "n m"], gate: float
-) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
+    cost: Float[np.ndarray, "n m"], gate: float
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """Rows and columns of the partial matching that minimises the sum of costs, an unmatched pair counted as `gate`.
 
     Pairs that cost `gate` or more, infinity included, are never matched. One excellent pair is thus not given up for
     two poor ones. Rows come in ascending order.
     """
-    row, column = match_arrays(cost.detach().cpu().numpy(), gate)
-    return torch.from_numpy(row).to(cost.device), torch.from_numpy(column).to(cost.device)
-
-
-def match_arrays(
-    cost: Float[np.ndarray, "n m"], gate: float
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """`gated_matching` of NumPy's arrays, for loops over frames."""
     # What a match gains over none: where that is zero, an assignment of all rows may still pass through, and is
     # dropped.
     gain = np.maximum(gate - cost, 0)
@@ -51,10 +45,6 @@ class WindowPairs:
         """Number of pairs."""
         return int(self.count.sum())
 
-    def to(self, device: torch.device | str) -> WindowPairs:
-        """The same pairs on another device."""
-        return WindowPairs(self.first.to(device), self.start.to(device), self.count.to(device))
-
     def chunks(self, size: int) -> Iterator[tuple[Int[Tensor, " p"], Int[Tensor, " p"]]]:
         """The pairs in order, (earlier rows, later rows), at most `size` of them at once."""
         for begin in range(0, self.total, size):
@@ -63,15 +53,58 @@ class WindowPairs:
             later = torch.searchsorted(self.start, pair, right=True) - 1
             yield self.first[later] + pair - self.start[later], later
 
-    def index(self, earlier: Int[Tensor, "*b"], later: Int[Tensor, "*b"]) -> Int[Tensor, "*b"]:
-        """Number of each pair; -1 for rows that are not within the window of each other."""
-        rank = earlier - self.first[later]
-        inside = (rank >= 0) & (rank < self.count[later])
-        return torch.where(inside, self.start[later] + rank, -1)
-
 
 def window_pairs(time: Int[Tensor, " d"], window: int) -> WindowPairs:
     """Pairs of rows at times `t` and `t + 1 .. t + window`; `time` must not decrease."""
     first = torch.searchsorted(time, time - window)
     count = torch.searchsorted(time, time) - first
     return WindowPairs(first=first, start=count.cumsum(0) - count, count=count)
+
+
+def match_slots(
+    row: Int[Tensor, " p"],
+    slot: Int[Tensor, " p"],
+    cost: Float[Tensor, " p"],
+    *,
+    rows: int,
+    unmatched_cost: float,
+) -> Int[Tensor, " n"]:
+    """The slot of each of the `rows` rows, -1 for none, at the least total cost.
+
+    Each slot takes at most one row; a row left without a slot costs `unmatched_cost`, so dearer pairs are never used.
+    Rows whose cheapest slots differ from all others' take those at once; only where rows compete is an assignment
+    problem solved, one for each set of rows that are connected by their candidates.
+    """
+    device = row.device
+    keep = (cost < unmatched_cost).cpu().numpy()
+    i, raw, c = (t.detach().cpu().numpy()[keep] for t in (row, slot, cost))
+    result = np.full(rows, -1, dtype=np.int64)
+    if not len(i):
+        return torch.from_numpy(result).to(device)
+    slots, s = np.unique(raw, return_inverse=True)
+    order = np.lexsort((s, c, i))
+    first = np.concatenate(([True], i[order][1:] != i[order][:-1]))
+    best = order[first]  # the cheapest pair of every row that has one
+    taken = np.bincount(s[best], minlength=len(slots))
+    graph = sparse.coo_matrix((np.ones(len(i)), (i, rows + s)), shape=(rows + len(slots),) * 2)
+    _, part = connected_components(graph, directed=False)
+    contended = np.zeros(int(part.max()) + 1, dtype=bool)
+    contended[part[rows:][taken > 1]] = True
+    free = best[~contended[part[i[best]]]]
+    result[i[free]] = slots[s[free]]
+
+    pairs = np.nonzero(contended[part[i]])[0]
+    pairs = pairs[np.argsort(part[i[pairs]], kind="stable")]
+    if len(pairs):
+        cuts = np.nonzero(np.diff(part[i[pairs]]))[0] + 1
+        for block in np.split(pairs, cuts):
+            block_rows, r = np.unique(i[block], return_inverse=True)
+            block_slots, k = np.unique(s[block], return_inverse=True)
+            matrix = np.full((len(block_rows), len(block_slots) + len(block_rows)), 1e12)
+            matrix[r, k] = c[block]
+            own = np.arange(len(block_rows))
+            matrix[own, len(block_slots) + own] = unmatched_cost
+            chosen_rows, chosen = linear_sum_assignment(matrix)
+            real = chosen < len(block_slots)
+            result[block_rows[chosen_rows[real]]] = slots[block_slots[chosen[real]]]
+    return torch.from_numpy(result).to(device)

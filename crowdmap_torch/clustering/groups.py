@@ -1,17 +1,17 @@
-"""Sums, medians and majorities of the rows of each group; a group is a label column, rows labelled -1 are in none."""
+"""Sums, medians, majorities and extremes over groups of rows; a label column says the group, -1 none."""
 
 from __future__ import annotations
 
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 
 def group_sum(
-    value: Float[Tensor, "n ..."], label: Int[Tensor, " n"], groups: int
-) -> Float[Tensor, "g ..."]:
+    value: Shaped[Tensor, "n ..."], label: Int[Tensor, " n"], groups: int
+) -> Shaped[Tensor, "g ..."]:
     """Sum over each group; zero for an empty one."""
     used = label >= 0
     total = value.new_zeros(groups, *value.shape[1:])
@@ -96,9 +96,33 @@ def pairs_within(label: Int[Tensor, " n"]) -> Int[Tensor, "p 2"]:
     start = torch.repeat_interleave(size.cumsum(0) - size, size)
     place = torch.arange(len(rows), device=label.device) - start  # rank within the group
     # Every row is paired with those before it in its group.
-    second = torch.repeat_interleave(torch.arange(len(rows), device=label.device), place)
-    offset = torch.arange(len(second), device=label.device) - torch.repeat_interleave(
-        place.cumsum(0) - place, place
-    )
-    first = start[second] + offset
+    second, first = rows_of_ranges(start, place)
     return torch.stack((rows[first], rows[second]), dim=1)
+
+
+def group_argmin(value: Float[Tensor, " n"], group: Int[Tensor, " n"]) -> Int[Tensor, " g"]:
+    """Row of the least value of each group, the first of equals; NaN is never less. Every group must have a row."""
+    groups = int(group.max()) + 1 if len(group) else 0
+    value = torch.where(value.isnan(), torch.inf, value)
+    least = value.new_full((groups,), torch.inf).scatter_reduce(0, group, value, "amin")
+    rows = torch.nonzero(value == least[group])[:, 0]
+    first = torch.full((groups,), len(value), dtype=torch.int64, device=value.device)
+    return first.scatter_reduce(0, group[rows], rows, "amin")
+
+
+def group_range(
+    value: Shaped[Tensor, " n"], group: Int[Tensor, " n"], groups: int
+) -> tuple[Shaped[Tensor, " g"], Shaped[Tensor, " g"]]:
+    """Least and largest value of each group; zero for an empty one."""
+    zero = value.new_zeros(groups)
+    least = zero.scatter_reduce(0, group, value, "amin", include_self=False)
+    return least, zero.scatter_reduce(0, group, value, "amax", include_self=False)
+
+
+def rows_of_ranges(
+    start: Int[Tensor, " g"], size: Int[Tensor, " g"]
+) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+    """The rows `start .. start + size - 1` of every range, each behind the number of its range."""
+    number = torch.repeat_interleave(torch.arange(len(size), device=size.device), size)
+    first = start - (size.cumsum(0) - size)
+    return number, first[number] + torch.arange(len(number), device=size.device)

@@ -1,4 +1,4 @@
-"""Pairs of points that are near each other, by a k-d tree: memory grows with the number of points, not of pairs."""
+"""Pairs of points that are near each other, by a k-d tree."""
 
 from __future__ import annotations
 
@@ -9,10 +9,16 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 
+def pairs_in_radius(point: Float[Tensor, "n d"], radius: float) -> Int[Tensor, "m 2"]:
+    """All unordered pairs of points within `radius`, the smaller row first: memory grows with the pairs."""
+    pair = KDTree(point.detach().cpu().numpy()).query_pairs(radius, output_type="ndarray")
+    return torch.from_numpy(pair.astype(np.int64)).to(point.device)
+
+
 def near_pairs(point: Float[Tensor, "n d"], *, radius: float, count: int) -> Int[Tensor, "m 2"]:
     """Unordered pairs of points within `radius`, where one is among the `count` nearest of the other.
 
-    The first index of a pair is the smaller one; pairs are sorted.
+    The first index of a pair is the smaller one; pairs are sorted. Memory grows with the number of points.
     """
     n = len(point)
     if n < 2:
@@ -42,3 +48,18 @@ def cross_pairs(
     pairs = np.stack((i, found[i, place]), axis=1)
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
     return torch.from_numpy(pairs[order]).to(query.device)
+
+
+def pairs_between(
+    a: Float[Tensor, "n d"], b: Float[Tensor, "m d"], *, radius: float
+) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"], Float[Tensor, " p"]]:
+    """All pairs of points within `radius`: row of a, row of b, distance; sorted by rows."""
+    if not len(a) or not len(b):
+        empty = torch.zeros(0, dtype=torch.int64, device=a.device)
+        return empty, empty, a.new_zeros(0)
+    tree_a, tree_b = (KDTree(p.detach().cpu().numpy()) for p in (a, b))
+    pairs = tree_a.sparse_distance_matrix(tree_b, radius, output_type="ndarray")
+    pairs = pairs[np.lexsort((pairs["j"], pairs["i"]))]
+    row_a, row_b = (torch.as_tensor(pairs[name].astype(np.int64)) for name in ("i", "j"))
+    distance = torch.as_tensor(pairs["v"].copy()).to(a)
+    return row_a.to(a.device), row_b.to(a.device), distance

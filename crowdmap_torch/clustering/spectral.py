@@ -192,11 +192,6 @@ def renumber(label: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
     return result
 
 
-def same_partition(a: Int[Tensor, " n"], b: Int[Tensor, " n"]) -> bool:
-    """True if two labellings group the rows alike, whatever the names of the groups."""
-    return bool((renumber(a) == renumber(b)).all())
-
-
 def _labels(
     vectors: Float[Tensor, "n k"], config: SpectralConfig, generator: torch.Generator | None
 ) -> Int[Tensor, " n"]:

@@ -1,1 +1,1 @@
-"""What METRICS.md defines, paragraph by paragraph; `crowdmap_torch.evaluate` composes it."""
+"""What METRICS.md defines, paragraph by paragraph; `evaluation.evaluate` composes it."""

@@ -13,8 +13,8 @@ from crowdmap_torch.evaluation.polyline import (
     Crossings,
     Samples,
     crossings,
+    lane_samples,
     nearest,
-    sample_lanes,
     sample_polylines,
 )
 from crowdmap_torch.evaluation.statistics import ErrorFigures, error_figures, share
@@ -83,27 +83,7 @@ def evaluate_lanes(
     """
     config = config or LaneEvaluationConfig()
     true = survey_samples(survey, config.step_m)
-    mapped = sample_lanes(lanes, config.step_m)
-    return evaluate_samples(
-        mapped,
-        true,
-        seen_by=seen_by,
-        shift=shift,
-        shared_covariance=shared_covariance,
-        config=config,
-    )
-
-
-def evaluate_samples(
-    mapped: Samples,
-    true: Samples,
-    *,
-    seen_by: Int[Tensor, " p"] | None,
-    shift: Float[Tensor, " 3"] | None,
-    shared_covariance: Float[Tensor, "3 3"] | None,
-    config: LaneEvaluationConfig,
-) -> LaneFigures:
-    """Figures of sampled lines against sampled markers."""
+    mapped = lane_samples(lanes, config.step_m)
     seen = torch.ones_like(true.line, dtype=torch.bool)
     if seen_by is not None:
         seen = seen_by >= config.min_journeys

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.evaluation.matching import near_pairs
+from crowdmap_torch.clustering.groups import group_argmin
+from crowdmap_torch.clustering.neighbours import pairs_between
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.tables import Lanes, Rows
 
@@ -91,7 +92,7 @@ def sample_polylines(
     )
 
 
-def sample_lanes(lanes: Lanes, step_m: float) -> Samples:
+def lane_samples(lanes: Lanes, step_m: float) -> Samples:
     """Points every `step_m` along the splines of lane pieces, sigma interpolated."""
     packed = lanes.select(torch.arange(len(lanes), device=lanes.control_count.device))
     count, start = packed.control_count, packed.control_start
@@ -136,7 +137,7 @@ def crossings(
     a, b = lines.point_world[start], lines.point_world[start + 1]
     half = float((b - a)[:, :2].norm(dim=-1).max()) / 2 if len(start) else 0.0
     radius = (lateral_m**2 + (half + _TOUCH_M) ** 2) ** 0.5
-    point, segment, _ = near_pairs(centre, (a + b)[:, :2] / 2, radius)
+    point, segment, _ = pairs_between(centre, (a + b)[:, :2] / 2, radius=radius)
     from_a, from_b = (p[segment] - at.point_world[point] for p in (a, b))
     ahead_a, ahead_b = ((v[:, :2] * at.along[point]).sum(-1) for v in (from_a, from_b))
     span = ahead_b - ahead_a
@@ -160,19 +161,11 @@ def crossings(
 def nearest(found: Crossings, offset_m: Tensor | None = None) -> Crossings:
     """Of the crossings of each point the one with the smallest lateral distance (to the offset)."""
     distance = found.lateral if offset_m is None else found.lateral - offset_m[found.point]
-    order = distance.abs().argsort(stable=True)
-    order = order[found.point[order].argsort(stable=True)]
-    ordered = found[order]
-    first = torch.ones_like(ordered.point, dtype=torch.bool)
-    first[1:] = ordered.point[1:] != ordered.point[:-1]
-    return ordered[first]
+    _, group = found.point.unique(return_inverse=True)
+    return found[group_argmin(distance.abs(), group)]
 
 
 def _nearest_of_each_line(found: Crossings, offset: Tensor) -> Crossings:
-    order = (found.lateral - offset[found.point]).abs().argsort(stable=True)
-    order = order[found.line[order].argsort(stable=True)]
-    order = order[found.point[order].argsort(stable=True)]
-    ordered = found[order]
-    first = torch.ones_like(ordered.point, dtype=torch.bool)
-    first[1:] = (ordered.point[1:] != ordered.point[:-1]) | (ordered.line[1:] != ordered.line[:-1])
-    return ordered[first]
+    pair = torch.stack((found.point, found.line), dim=1)
+    _, group = pair.unique(dim=0, return_inverse=True)
+    return found[group_argmin((found.lateral - offset[found.point]).abs(), group)]

@@ -8,22 +8,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from crowdmap_torch.evaluation.matching import (
-    DUPLICATE,
-    FALSE,
-    SignMatch,
-    SignMatchConfig,
-    match_signs,
-    near_pairs,
-)
+from crowdmap_torch.clustering.neighbours import pairs_between
 from crowdmap_torch.evaluation.statistics import (
     ErrorFigures,
     PositionFigures,
     error_figures,
+    mean_lengths,
     position_figures,
     share,
 )
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.survey.matching import (
+    DUPLICATE,
+    FALSE,
+    SurveyMatch,
+    SurveyMatchConfig,
+    match_to_survey,
+)
 from crowdmap_torch.tables import Signs, SurveySigns
 
 
@@ -31,7 +32,7 @@ from crowdmap_torch.tables import Signs, SurveySigns
 class SignEvaluationConfig:
     """How signs are matched and which neighbours the relative error looks at."""
 
-    match: SignMatchConfig = field(default_factory=SignMatchConfig)
+    match: SurveyMatchConfig = field(default_factory=SurveyMatchConfig)
     relative_radius_m: float = 150.0
     """Matched signs within this distance are brought onto the truth together."""
     relative_min_signs: int = 3
@@ -44,7 +45,7 @@ class SignEvaluationConfig:
 class SignComparison:
     """Every matched sign beside its true one, control signs left out."""
 
-    match: SignMatch
+    match: SurveyMatch
     """Before control signs are left out."""
     map_row: Tensor
     true_row: Tensor
@@ -70,6 +71,14 @@ class SignComparison:
     """Of each survey sign, control signs excepted."""
     control: Bool[Tensor, " n"]
     """Of each survey sign."""
+
+    def error_m(self, kind: str) -> Float[Tensor, " k"]:
+        """The `absolute` or `relative` error of each sign: the mean over its corners, of its centre without them."""
+        corner, center = self.corner_error_world, self.center_error_world
+        if kind == "relative":
+            corner, center = self.relative_corner_world, self.relative_center_world
+        at_corners, _, _ = mean_lengths(corner, self.corner_mask)
+        return at_corners.where(self.corner_mask.any(-1), center[:, 0].norm(dim=-1))
 
 
 @dataclass(frozen=True)
@@ -137,7 +146,7 @@ def compare_signs(
     nothing = torch.zeros(len(survey), dtype=torch.bool, device=survey.shape.device)
     control = nothing if control is None else control
     observable = ~control if observable is None else observable & ~control
-    match = match_signs(signs, survey, config.match)
+    match = match_to_survey(signs, survey, config.match)
     keep = ~control[match.true_row]
     map_row, true_row = match.map_row[keep], match.true_row[keep]
     matched, truth = signs[map_row], survey[true_row]
@@ -263,7 +272,9 @@ def _relative_errors(
     The translation and yaw minimise the squared distance of the centres of all counted signs
     around it, itself included.
     """
-    one, other, _ = near_pairs(center_true, center_true[counted], config.relative_radius_m)
+    one, other, _ = pairs_between(
+        center_true, center_true[counted], radius=config.relative_radius_m
+    )
     other = counted.nonzero()[:, 0][other]
     number = torch.zeros_like(center_map[:, 0]).index_add(
         0, one, torch.ones_like(center_map[one, 0])
@@ -282,11 +293,7 @@ def _relative_errors(
     p, q = ahead_map - mean_map[one], ahead_true - mean_true[one]
     turn = around(
         torch.stack(
-            (
-                p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1],
-                p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0],
-            ),
-            dim=-1,
+            (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1], p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), dim=-1
         )
     )
     yaw = torch.atan2(turn[:, 1], turn[:, 0])
@@ -305,7 +312,7 @@ def _relative_errors(
 
 def _close_pairs(comparison: SignComparison, survey: SurveySigns, radius: float) -> tuple[int, int]:
     """Pairs of observable signs on one post that face one way, and how many are both matched."""
-    one, other, _ = near_pairs(survey.center_world, survey.center_world, radius)
+    one, other, _ = pairs_between(survey.center_world, survey.center_world, radius=radius)
     facing = (survey.normal_world[one] * survey.normal_world[other]).sum(-1)
     seen = comparison.observable[one] & comparison.observable[other]
     pair = (one < other) & seen & ~(facing < 0)

@@ -8,14 +8,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from crowdmap_torch.clustering.groups import group_argmin
+from crowdmap_torch.clustering.neighbours import pairs_between
 from crowdmap_torch.evaluation.lanes import (
     LaneEvaluationConfig,
     survey_samples,
     width_errors,
     within_gate,
 )
-from crowdmap_torch.evaluation.matching import DUPLICATE, FALSE, near_pairs
-from crowdmap_torch.evaluation.polyline import Samples, nearest, sample_lanes
+from crowdmap_torch.evaluation.polyline import Samples, lane_samples, nearest
 from crowdmap_torch.evaluation.signs import SignEvaluationConfig, compare_signs
 from crowdmap_torch.evaluation.statistics import (
     ErrorFigures,
@@ -28,6 +29,7 @@ from crowdmap_torch.evaluation.visibility import frames_of_signs
 from crowdmap_torch.geometry import camera as camera_module
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.truth import JourneyTruth
+from crowdmap_torch.survey.matching import DUPLICATE, FALSE
 from crowdmap_torch.tables import Lanes, Signs, Survey
 
 _SIGN_RANGE_M = 120.0
@@ -114,34 +116,28 @@ def evaluate_single_journeys(
     ]
     if not parts:
         raise ValueError("no journey to evaluate: expected at least one with landmarks and truth")
-    corner, mask, center, normal, lateral, vertical, width = (
-        torch.cat([getattr(p, name) for p in parts])
-        for name in (
-            "corner",
-            "corner_mask",
-            "center",
-            "normal_deg",
-            "lateral",
-            "vertical",
-            "width",
-        )
-    )
-    signs = sum(p.signs for p in parts)
+
+    def joined(name: str) -> Tensor:
+        return torch.cat([getattr(part, name) for part in parts])
+
+    def total(name: str) -> int:
+        return sum(getattr(part, name) for part in parts)
+
+    center, mask, signs = joined("center"), joined("corner_mask"), total("signs")
+    every = torch.ones_like(center[..., 0], dtype=torch.bool)
     return SingleJourneyFigures(
         journeys=len(parts),
         signs=signs,
-        corner=position_figures(corner, mask, mask.any(-1)),
-        center=position_figures(
-            center, torch.ones_like(center[..., 0], dtype=torch.bool), torch.ones_like(mask[:, 0])
-        ),
-        normal_deg=error_figures(normal),
-        recall=share(sum(p.found for p in parts), sum(p.expected for p in parts)),
-        duplicates=share(sum(p.duplicates for p in parts), signs),
-        ghosts=share(sum(p.false for p in parts), signs),
-        lane_lateral=error_figures(lateral.abs()),
-        lane_vertical=error_figures(vertical.abs()),
-        lane_width=error_figures(width),
-        lane_precision=share(sum(p.lane_right for p in parts), sum(p.lane_samples for p in parts)),
+        corner=position_figures(joined("corner"), mask, mask.any(-1)),
+        center=position_figures(center, every, every[:, 0]),
+        normal_deg=error_figures(joined("normal_deg")),
+        recall=share(total("found"), total("expected")),
+        duplicates=share(total("duplicates"), signs),
+        ghosts=share(total("false"), signs),
+        lane_lateral=error_figures(joined("lateral").abs()),
+        lane_vertical=error_figures(joined("vertical").abs()),
+        lane_width=error_figures(joined("width")),
+        lane_precision=share(total("lane_right"), total("lane_samples")),
     )
 
 
@@ -156,11 +152,11 @@ def _evaluate_one(
     c = compare_signs(signs, survey.signs, config=config.signs)
     expected = frames_of_signs(truth, len(survey.signs)) >= config.min_frames
     found = torch.zeros_like(expected).index_fill(0, c.true_row, True)
-    mapped = sample_lanes(landmarks.lanes, config.lanes.step_m)
+    mapped = lane_samples(landmarks.lanes, config.lanes.step_m)
     # A pose error changes slowly: samples share the view of one a few metres before them.
     anchor = _anchors(mapped.line, max(round(_VIEW_STEP_M / config.lanes.step_m), 1))
     anchors, of_sample = anchor.unique(return_inverse=True)
-    frame = closest_view(truth, mapped.point_world[anchors], _LANE_RANGE_M)[of_sample]
+    frame = nearest_seeing_frame(truth, mapped.point_world[anchors], _LANE_RANGE_M)[of_sample]
     moved = se3.transform(truth.T_true_given[frame], mapped.point_world)
     mapped = replace(mapped, point_world=moved)
     # From the map's points to the true markers: a journey sees pieces, and nobody expects the rest
@@ -195,11 +191,11 @@ def _anchors(line: Int[Tensor, " p"], every: int) -> Int[Tensor, " p"]:
 
 def without_pose_error(signs: Signs, truth: JourneyTruth) -> Signs:
     """The signs as they would be had the pose at closest approach been the true one."""
-    frame = closest_view(truth, signs.center_world, _SIGN_RANGE_M)
+    frame = nearest_seeing_frame(truth, signs.center_world, _SIGN_RANGE_M)
     return replace(signs, T_world_sign=truth.T_true_given[frame] @ signs.T_world_sign)
 
 
-def closest_view(
+def nearest_seeing_frame(
     truth: JourneyTruth, point_world: Float[Tensor, "n 3"], range_m: float
 ) -> Int[Tensor, " n"]:
     """For each point (world as the given poses have it) the nearest frame that has it in its image.
@@ -210,16 +206,12 @@ def closest_view(
     """
     T_camera_world = se3.inverse(truth.journey.T_world_camera)
     position = truth.journey.T_world_camera[:, :3, 3]
-    point, frame, distance = near_pairs(point_world, position, range_m)
+    point, frame, distance = pairs_between(point_world, position, radius=range_m)
     in_camera = se3.transform(T_camera_world[frame], point_world[point])
     _, visible = camera_module.project(truth.journey.rig.camera, in_camera)
     # A frame that does not see the point loses against every frame that does, and the nearest of
     # those is left otherwise.
     cost = torch.where(visible, distance, distance + 10 * range_m)
-    order = cost.argsort(stable=True)
-    order = order[point[order].argsort(stable=True)]
-    point, frame = point[order], frame[order]
-    first = torch.ones_like(point, dtype=torch.bool)
-    first[1:] = point[1:] != point[:-1]
+    points, group = point.unique(return_inverse=True)
     closest = torch.zeros(len(point_world), dtype=torch.int64, device=point_world.device)
-    return closest.index_put((point[first],), frame[first])
+    return closest.index_put((points,), frame[group_argmin(cost, group)])

@@ -1,10 +1,9 @@
-"""Mean, median, 95th percentile and spread of errors, and how they turn into plain JSON."""
+"""Mean, median, 95th percentile and spread of errors."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -76,21 +75,6 @@ def mean_lengths(
 def share(part: int, whole: int) -> float:
     """`part / whole`, NaN of nothing."""
     return part / whole if whole else math.nan
-
-
-def plain(value: Any) -> Any:
-    """Nested dataclasses, tensors and tuples as plain JSON; what is not finite becomes None."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Tensor):
-        return plain(value.detach().cpu().tolist())
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def _quantile(ordered: Float[Tensor, " n"], q: float) -> float:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from crowdmap_torch.clustering.groups import group_argmin
 from crowdmap_torch.evaluation.polyline import Samples
 from crowdmap_torch.evaluation.statistics import PositionFigures, position_figures
 from crowdmap_torch.geometry import polygon, se3
@@ -51,7 +52,7 @@ def oracle_figures(
     center_sum = torch.zeros_like(survey.center_world)
     seen = torch.zeros_like(survey.center_world[:, 0])
     for journey in truth.journeys:
-        sign, frame = closest_approach(journey, survey)
+        sign, frame = nearest_detections(journey, survey)
         T_given_true = se3.inverse(journey.T_true_given)[frame]
         corner = survey.corners_world[sign]
         center = survey.center_world[sign]
@@ -72,19 +73,15 @@ def oracle_figures(
     )
 
 
-def closest_approach(
+def nearest_detections(
     truth: JourneyTruth, survey: SurveySigns
 ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
     """The signs that a journey detects, and the nearest frame in which each is detected."""
     shown = (truth.sign >= 0) & (truth.sign_frame >= 0)
     sign, frame = truth.sign[shown], truth.sign_frame[shown]
     distance = (truth.T_world_camera[frame, :3, 3] - survey.center_world[sign]).norm(dim=-1)
-    order = distance.argsort(stable=True)
-    order = order[sign[order].argsort(stable=True)]
-    sign, frame = sign[order], frame[order]
-    first = torch.ones_like(sign, dtype=torch.bool)
-    first[1:] = sign[1:] != sign[:-1]
-    return sign[first], frame[first]
+    detected, group = sign.unique(return_inverse=True)
+    return detected, frame[group_argmin(distance, group)]
 
 
 def seen_by_journeys(truth: Truth, samples: Samples) -> Int[Tensor, " p"]:
@@ -135,15 +132,9 @@ def _row_of_extreme(
 ) -> Int[Tensor, " g"]:
     """The row of the smallest usable value of each group; -1 for a group without one."""
     rows = usable.nonzero()[:, 0]
-    order = rows[value[rows].argsort(stable=True, descending=True)]
-    out = torch.full((count,), -1, dtype=torch.int64, device=value.device)
-    # Rows come from the largest value to the smallest; a sort by group keeps that order, so the
-    # last of a group is its least.
-    order = order[group[order].argsort(stable=True)]
-    last = torch.ones_like(order, dtype=torch.bool)
-    last[:-1] = group[order][1:] != group[order][:-1]
-    out[group[order][last]] = order[last]
-    return out
+    groups, dense = group[rows].unique(return_inverse=True)
+    none = torch.full((count,), -1, dtype=torch.int64, device=value.device)
+    return none.index_put((groups,), rows[group_argmin(value[rows], dense)])
 
 
 def _nearest_sample(

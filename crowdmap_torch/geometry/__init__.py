@@ -1,1 +1,1 @@
-"""Geometry: poses, cameras, rigs, rays, planes, polygons, curves."""
+"""Maths on tensors: poses, cameras, rigs, rays, planes, polygons, splines, ways."""

@@ -1,4 +1,4 @@
-"""Planes: the best fit, how flat points are, and where rays meet one (IV-B, IV-C)."""
+"""Planes: the best fit, how flat points are, and where rays meet the road (IV-B, IV-C)."""
 
 from __future__ import annotations
 
@@ -46,17 +46,6 @@ def harmonic_mean_singular_value(S: Float[Tensor, "*batch 3 3"]) -> Float[Tensor
     det = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     regular = minors > torch.finfo(S.dtype).tiny
     return torch.where(regular, 3 * det / torch.where(regular, minors, 1.0), 0.0)
-
-
-def intersect_plane(
-    origin: Float[Tensor, "*#batch 3"],
-    ray: Float[Tensor, "*#batch 3"],
-    point: Float[Tensor, "*#batch 3"],
-    normal: Float[Tensor, "*#batch 3"],
-) -> Float[Tensor, "*#batch 3"]:
-    """Where lines `origin + s ray` meet the plane through `point`; not finite if parallel to it."""
-    s = ((point - origin) * normal).sum(-1) / (ray * normal).sum(-1)
-    return origin + s[..., None] * ray
 
 
 def ground_points(

@@ -20,34 +20,32 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import plane, se3
 
-SHAPES = ("triangle", "inverted_triangle", "rectangle", "diamond", "pentagon", "octagon")
-MAX_CORNERS = 8
-CORNER_COUNT = torch.tensor([3, 3, 4, 4, 5, 8])
-"""Corners of each shape."""
-
-TRIANGLE, INVERTED_TRIANGLE, RECTANGLE, DIAMOND, PENTAGON, OCTAGON = range(len(SHAPES))
-
 _CUT = 0.5 - (1 - math.sqrt(0.5))
 """Half the side of an octagon of width 1: corners at 0.2929 and 0.7071 of the box's sides."""
-_BOX_CORNERS = (
-    ((0, 0.5), (0.5, -0.5), (-0.5, -0.5)),
-    ((-0.5, 0.5), (0.5, 0.5), (0, -0.5)),
-    ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)),
-    ((0, 0.5), (0.5, 0), (0, -0.5), (-0.5, 0)),
-    ((0, 0.5), (0.5, 0), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0)),
-    (
+_BOX_CORNERS = {
+    "triangle": ((0, 0.5), (0.5, -0.5), (-0.5, -0.5)),
+    "inverted_triangle": ((-0.5, 0.5), (0.5, 0.5), (0, -0.5)),
+    "rectangle": ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)),
+    "diamond": ((0, 0.5), (0.5, 0), (0, -0.5), (-0.5, 0)),
+    "pentagon": ((0, 0.5), (0.5, 0), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0)),
+    "octagon": (
         *((-_CUT, 0.5), (_CUT, 0.5), (0.5, _CUT), (0.5, -_CUT)),
         *((_CUT, -0.5), (-_CUT, -0.5), (-0.5, -_CUT), (-0.5, _CUT)),
     ),
-)
-"""Corners of each shape in a box of width and height 1 around the origin."""
+}
+"""Corners of each shape in a box of width and height 1 around the origin, symmetric about one of its axes at least."""
+SHAPES = tuple(_BOX_CORNERS)
+TRIANGLE, INVERTED_TRIANGLE, RECTANGLE, DIAMOND, PENTAGON, OCTAGON = range(6)
+MAX_CORNERS = 8
+CORNER_COUNT = torch.tensor([len(corners) for corners in _BOX_CORNERS.values()])
+"""Corners of each shape."""
 _REGULAR_TOLERANCE = 0.02
 """If width and height differ by less, any of an octagon's eight sides can be the top."""
 
 
 def _build_template() -> Tensor:
     rows = []
-    for corners_box in _BOX_CORNERS:
+    for corners_box in _BOX_CORNERS.values():
         padded = corners_box + corners_box[-1:] * (MAX_CORNERS - len(corners_box))
         centred = torch.tensor(padded, dtype=torch.float64)
         rows.append(centred - centred[: len(corners_box)].mean(0))
@@ -107,9 +105,7 @@ def pad(
 
 
 def roll(
-    corners: Float[Tensor, "*batch 8 k"],
-    shift: Int[Tensor, "*batch"],
-    count: Int[Tensor, "*batch"],
+    corners: Float[Tensor, "*batch 8 k"], shift: Int[Tensor, "*batch"], count: Int[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 8 k"]:
     """Corners in another cyclic order: corner k of the result is corner `(k + shift) % count`."""
     slot = torch.arange(MAX_CORNERS, device=count.device)

@@ -61,6 +61,33 @@ def so3_log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     )
 
 
+def right_jacobian_inverse(w: Float[Tensor, "3 *#rows"]) -> Float[Tensor, "3 3 *#rows"]:
+    """Inverse right Jacobian of SO(3): `log(exp(w) exp(d)) = w + J d` to first order (Chirikjian 2012).
+
+    The rows come last, as in residuals, which alone take it.
+    """
+    x, y, z = w / 2
+    theta_sq = w.square().sum(0)
+    # Bernoulli numbers' series below a tenth of a radian, where the next term is below 1e-13.
+    small = theta_sq < 0.01
+    theta = torch.where(small, torch.ones_like(theta_sq), theta_sq).sqrt()
+    factor = torch.where(
+        small,
+        1 / 12 + theta_sq * (1 / 720 + theta_sq * (1 / 30240 + theta_sq / 1209600)),
+        (1 - theta * (1 + theta.cos()) / (2 * theta.sin())) / theta.square(),
+    )
+    # I + W / 2 + factor W W, where W W = w w^T - |w|^2 I.
+    a = 4 * factor
+    xx, yy, zz = a * x * x, a * y * y, a * z * z
+    xy, xz, yz = a * x * y, a * x * z, a * y * z
+    rows = (
+        *(1 - yy - zz, xy - z, xz + y),
+        *(xy + z, 1 - xx - zz, yz - x),
+        *(xz - y, yz + x, 1 - xx - yy),
+    )
+    return torch.stack(rows).unflatten(0, (3, 3))
+
+
 def make(
     R: Float[Tensor, "*batch 3 3"], p: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:

@@ -2,17 +2,16 @@
 
 *Control points* are what the curve passes through at its knots (the paper's representation, and a
 map's). *Coefficients* are those of the same curve in cubic B-splines: each point of the curve
-depends on four of them only, which keeps a bundle adjustment sparse. `to_coefficients` and
-`from_coefficients` change between the two; both have C rows, because the natural ends (no
+depends on four of them only, which keeps a bundle adjustment sparse. `to_coefficients_flat` and
+`from_coefficients_flat` change between the two; both have C rows, because the natural ends (no
 curvature) fold the two outer coefficients into their neighbours, `c_-1 = 2 c_0 - c_1`.
 
 Functions ending in `_flat` take many splines at once, their rows packed one spline after the other,
-`count[i]` rows for spline i. Beyond its ends a spline goes on as a straight line.
+`count[i]` rows for spline i. Beyond its ends a spline goes on as a straight line. `spline_fit` fits
+splines to points, `spline_length` measures along them.
 """
 
 from __future__ import annotations
-
-import math
 
 import torch
 from jaxtyping import Float, Int
@@ -88,9 +87,7 @@ def window_with_curvature(
 
 
 def window_flat(
-    t: Float[Tensor, " m"],
-    start_of_spline: Int[Tensor, " m"],
-    count_of_spline: Int[Tensor, " m"],
+    t: Float[Tensor, " m"], start_of_spline: Int[Tensor, " m"], count_of_spline: Int[Tensor, " m"]
 ) -> tuple[Int[Tensor, "m 4"], Float[Tensor, "m 4"], Float[Tensor, "m 4"]]:
     """Rows of packed coefficients, weights and their derivatives by t, for points on many splines.
 
@@ -139,41 +136,6 @@ def from_coefficients_flat(
     return torch.where(interior, (neighbours + 4 * coefficient) / 6, coefficient)
 
 
-def to_coefficients(control: Float[Tensor, "*batch C k"]) -> Float[Tensor, "*batch C k"]:
-    """B-spline coefficients of splines that pass through `control`."""
-    return to_coefficients_flat(control.flatten(0, -2), _equal_counts(control)).reshape(
-        control.shape
-    )
-
-
-def from_coefficients(coefficient: Float[Tensor, "*batch C k"]) -> Float[Tensor, "*batch C k"]:
-    """Points at the knots, the inverse of `to_coefficients`."""
-    flat = from_coefficients_flat(coefficient.flatten(0, -2), _equal_counts(coefficient))
-    return flat.reshape(coefficient.shape)
-
-
-def basis(t: Float[Tensor, " m"], count: int) -> Float[Tensor, "m C"]:
-    """The matrix that takes `count` control points to the points of the curve at parameters t."""
-    identity = torch.eye(count, dtype=t.dtype, device=t.device)
-    return _combine(to_coefficients(identity), *window(t, count)[:2])
-
-
-def evaluate(
-    control: Float[Tensor, "*#batch C k"], t: Float[Tensor, "*#batch m"]
-) -> Float[Tensor, "*#batch m k"]:
-    """Points of the curves at parameters t."""
-    start, weight, _ = window(t, control.shape[-2])
-    return _combine(to_coefficients(control), start, weight)
-
-
-def derivative(
-    control: Float[Tensor, "*#batch C k"], t: Float[Tensor, "*#batch m"]
-) -> Float[Tensor, "*#batch m k"]:
-    """Derivatives of the curves by the parameter (per knot, not per metre)."""
-    start, _, d_weight = window(t, control.shape[-2])
-    return _combine(to_coefficients(control), start, d_weight)
-
-
 def evaluate_flat(
     control: Float[Tensor, "c k"],
     count: Int[Tensor, " n"],
@@ -198,23 +160,6 @@ def _flat(control: Tensor, count: Tensor, t: Tensor, spline: Tensor, part: int) 
     windows = window_flat(t, starts(count)[spline], count[spline])
     coefficient = to_coefficients_flat(control, count)
     return (windows[part][..., None] * coefficient[windows[0]]).sum(-2)
-
-
-def _combine(coefficient: Tensor, start: Tensor, weight: Tensor) -> Tensor:
-    """Weighted sums of four rows of `[*batch, C, k]` for `[*batch, m]` starts."""
-    slot = torch.arange(4, device=start.device)
-    index = (start[..., None] + slot).clamp_max(coefficient.shape[-2] - 1)
-    batch = torch.broadcast_shapes(coefficient.shape[:-2], start.shape[:-1])
-    coefficient = coefficient.expand(*batch, *coefficient.shape[-2:])
-    index, weight = (part.expand(*batch, *part.shape[-2:]) for part in (index, weight))
-    flat = index.flatten(-2)[..., None].expand(*batch, -1, coefficient.shape[-1])
-    taken = coefficient.gather(-2, flat).unflatten(-2, index.shape[-2:])
-    return (weight[..., None] * taken).sum(-2)
-
-
-def _equal_counts(control: Tensor) -> Tensor:
-    number = math.prod(control.shape[:-2])
-    return torch.full((number,), control.shape[-2], device=control.device)
 
 
 def _shifted(column: Tensor, step: int) -> Tensor:

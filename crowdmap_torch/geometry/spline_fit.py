@@ -16,40 +16,14 @@ from crowdmap_torch.geometry.spline_basis import (
     window_with_curvature,
 )
 
-_RIDGE = 1e-9
-"""Price of bending that is always charged, per unit of weight: it decides where no point does."""
+_LEAST_BENDING = 1e-9
+"""Price of bending that is always charged, per point: it decides where no point does."""
 _TRACE = 1e-13
 """Of the normal equations' size, added to their diagonal."""
+_SAMPLES_PER_KNOT, _NEWTON_STEPS = 4, 6
+"""Where the search for the nearest point starts, and how far it goes."""
 _CHUNK_POINTS = 1 << 22
 """Samples compared at once when the nearest point is searched for."""
-
-
-def fit(
-    points: Float[Tensor, "n k"],
-    count: int,
-    weight: Float[Tensor, " n"] | None = None,
-    t: Float[Tensor, " n"] | None = None,
-    smoothing: float = 0.0,
-    *,
-    refinements: int = 3,
-) -> Float[Tensor, "{count} k"]:
-    """Control points of the spline fitted to points in any order by least squares (IV-D).
-
-    Without parameters `t` the points are laid along their principal axis and then `refinements`
-    times moved to the nearest point of the curve: the curve must not turn back on itself. With `t`
-    they stay as given. `smoothing` is the price of bending, the integral over the knots of the
-    squared second derivative, in units of one point's weight.
-    """
-    t_given = t is not None
-    spline = torch.zeros(len(points), dtype=torch.long, device=points.device)
-    counts = torch.tensor([count], device=points.device)
-    t = t if t is not None else principal_parameter(points, spline, counts, weight)
-    control = fit_flat(points, spline, t, counts, weight, smoothing)
-    if not t_given:
-        control = refine_flat(
-            points, spline, control, counts, weight, smoothing, refinements=refinements
-        )
-    return control
 
 
 def fit_flat(
@@ -57,41 +31,37 @@ def fit_flat(
     spline: Int[Tensor, " m"],
     t: Float[Tensor, " m"],
     count: Int[Tensor, " n"],
-    weight: Float[Tensor, " m"] | None = None,
-    smoothing: Float[Tensor, " n"] | float = 0.0,
 ) -> Float[Tensor, "c k"]:
     """Packed control points of n splines fitted to points at known parameters.
 
     `spline` says whose each point is.
-    A spline without points, or with all its weight at one parameter, is determined only as far as
-    its ridge goes; the caller prunes.
+    A spline without points, or with all of them at one parameter, is determined only as far as
+    least bending goes; the caller prunes.
     """
-    weight = torch.ones_like(t) if weight is None else weight
     if not len(count):
         return points.new_zeros(0, points.shape[-1])
     n, longest = len(count), int(count.max())
     spline_of_row, rank = rows(count)
-    # Relative to the mean, the ridge pulls nothing and kilometres from the origin cost no digits.
-    total = weight.new_zeros(n).index_add(0, spline, weight)
-    mean = points.new_zeros(n, points.shape[-1]).index_add(0, spline, weight[:, None] * points)
-    mean = mean / torch.where(total > 0, total, 1.0)[:, None]
+    # Relative to the mean, the trace pulls nothing and kilometres from the origin cost no digits.
+    number = torch.bincount(spline, minlength=n).clamp_min(1).to(points)
+    mean = points.new_zeros(n, points.shape[-1]).index_add(0, spline, points) / number[:, None]
 
     zero = torch.zeros_like(count[spline])
     index, w, _ = window_flat(t, zero, count[spline])
-    square = weight[:, None, None] * w[:, :, None] * w[:, None, :]
+    square = w[:, :, None] * w[:, None, :]
     cell = (spline[:, None, None] * longest + index[:, :, None]) * longest + index[:, None, :]
     normal = points.new_zeros(n * longest * longest).index_add(0, cell.flatten(), square.flatten())
     rhs_cell = (spline[:, None] * longest + index).flatten()
-    pull = (weight[:, None] * w)[..., None] * (points - mean[spline])[:, None]
+    pull = w[..., None] * (points - mean[spline])[:, None]
     rhs = points.new_zeros(n * longest, points.shape[-1]).index_add(0, rhs_cell, pull.flatten(0, 1))
 
     normal = normal.reshape(n, longest, longest)
-    price = torch.as_tensor(smoothing).to(points) + _RIDGE * torch.where(total > 0, total, 1.0)
+    price = _LEAST_BENDING * number
     normal = normal + price[:, None, None] * bending(count, longest, points)
     # Ones in the slots past a spline's end; elsewhere a trace against rounding, where points do not
     # even fix a line.
     slot = torch.arange(longest, device=count.device)
-    trace = _TRACE * (torch.where(total > 0, total, 1.0) + price)[:, None]
+    trace = _TRACE * (number + price)[:, None]
     normal = normal + torch.diag_embed(torch.where(slot < count[:, None], trace, 1.0))
     factor, _ = torch.linalg.cholesky_ex(normal)
     coefficient = torch.cholesky_solve(rhs.reshape(n, longest, -1), factor)
@@ -104,35 +74,29 @@ def refine_flat(
     spline: Int[Tensor, " m"],
     control: Float[Tensor, "c k"],
     count: Int[Tensor, " n"],
-    weight: Float[Tensor, " m"] | None = None,
-    smoothing: Float[Tensor, " n"] | float = 0.0,
     *,
     refinements: int = 3,
 ) -> Float[Tensor, "c k"]:
     """Control points fitted again, each point moved to the parameter nearest to it."""
     for _ in range(refinements):
         t = closest_parameter_flat(control, count, points, spline)
-        control = fit_flat(points, spline, t, count, weight, smoothing)
+        control = fit_flat(points, spline, t, count)
     return control
 
 
 def principal_parameter(
-    points: Float[Tensor, "m k"],
-    spline: Int[Tensor, " m"],
-    count: Int[Tensor, " n"],
-    weight: Float[Tensor, " m"] | None = None,
+    points: Float[Tensor, "m k"], spline: Int[Tensor, " m"], count: Int[Tensor, " n"]
 ) -> Float[Tensor, " m"]:
     """Parameters in 0 .. C - 1 that are linear along the principal axis of each spline's points.
 
     The axis points towards increasing first coordinate, or second, or third where those before
     vanish.
     """
-    weight = torch.ones_like(points[:, 0]) if weight is None else weight
     n, k = len(count), points.shape[-1]
-    total = weight.new_zeros(n).index_add(0, spline, weight)
-    mean = points.new_zeros(n, k).index_add(0, spline, weight[:, None] * points)
-    centred = points - (mean / torch.where(total > 0, total, 1.0)[:, None])[spline]
-    outer = weight[:, None, None] * centred[:, :, None] * centred[:, None, :]
+    number = torch.bincount(spline, minlength=n).clamp_min(1).to(points)
+    mean = points.new_zeros(n, k).index_add(0, spline, points) / number[:, None]
+    centred = points - mean[spline]
+    outer = centred[:, :, None] * centred[:, None, :]
     scatter = points.new_zeros(n, k, k).index_add(0, spline, outer)
     axis = torch.linalg.eigh(scatter)[1][..., -1]
     # eigenvectors are free in sign
@@ -164,36 +128,11 @@ def bending(
     return second.mT @ mass @ second
 
 
-def closest_parameter(
-    control: Float[Tensor, "*batch C k"],
-    points: Float[Tensor, "*batch m k"],
-    *,
-    samples_per_knot: int = 4,
-) -> Float[Tensor, "*batch m"]:
-    """Parameters, within 0 .. C - 1, of the points of curves that are nearest to given points."""
-    length = control.shape[-2]
-    number = control[..., 0, 0].numel()
-    device = control.device
-    spline = torch.arange(number, device=device).repeat_interleave(points.shape[-2])
-    count = torch.full((number,), length, device=device)
-    t = closest_parameter_flat(
-        control.flatten(0, -2),
-        count,
-        points.flatten(0, -2),
-        spline,
-        samples_per_knot=samples_per_knot,
-    )
-    return t.reshape(points.shape[:-1])
-
-
 def closest_parameter_flat(
     control: Float[Tensor, "c k"],
     count: Int[Tensor, " n"],
     points: Float[Tensor, "m k"],
     spline: Int[Tensor, " m"],
-    *,
-    samples_per_knot: int = 4,
-    newton_steps: int = 6,
 ) -> Float[Tensor, " m"]:
     """Parameters of the points of packed splines that are nearest to given points.
 
@@ -204,7 +143,7 @@ def closest_parameter_flat(
     if not len(points):
         return points.new_zeros(0)
     longest = int(count.max())
-    number = samples_per_knot * (longest - 1) + 1
+    number = _SAMPLES_PER_KNOT * (longest - 1) + 1
     share = torch.linspace(0, 1, number, dtype=points.dtype, device=points.device)
     sample_t = share * (count[:, None] - 1)
     every = torch.arange(len(count), device=count.device).repeat_interleave(number)
@@ -223,7 +162,7 @@ def closest_parameter_flat(
     coefficient = to_coefficients_flat(control, count)
     start_of_spline, count_of_spline = starts(count)[spline], count[spline]
     slot = torch.arange(4, device=t.device)
-    for _ in range(newton_steps):
+    for _ in range(_NEWTON_STEPS):
         start, weight, d_weight, dd_weight = window_with_curvature(t, count_of_spline)
         rank = torch.minimum(start[:, None] + slot, count_of_spline[:, None] - 1)
         around = coefficient[start_of_spline[:, None] + rank]

@@ -8,11 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.geometry.spline_basis import (
-    derivative_flat,
-    evaluate_flat,
-    rows,
-)
+from crowdmap_torch.geometry.spline_basis import derivative_flat, evaluate_flat, rows
 
 # Gauss-Legendre on 0 .. 1, five nodes: exact up to degree nine on each half of a span between
 # knots.
@@ -26,13 +22,6 @@ _PARTS = 8
 
 _SAMPLE_ROUNDS = 4
 """How often samples that came out too far apart are made denser."""
-
-
-def arc_length(control: Float[Tensor, "*batch C k"]) -> Float[Tensor, "*batch"]:
-    """Lengths of curves [m]."""
-    number = control[..., 0, 0].numel()
-    count = torch.full((number,), control.shape[-2], device=control.device)
-    return arc_length_flat(control.flatten(0, -2), count).reshape(control.shape[:-2])
 
 
 def arc_length_flat(control: Float[Tensor, "c k"], count: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -101,24 +90,6 @@ def _sample(
     within = torch.where(spline[1:] == spline[:-1], chord, 0.0)
     longest = chord.new_zeros(len(count)).scatter_reduce(0, spline[1:], within, "amax")
     return point, t, spline, longest
-
-
-def resample_flat(
-    control: Float[Tensor, "c k"], count: Int[Tensor, " n"], new_count: Int[Tensor, " n"]
-) -> Float[Tensor, "d k"]:
-    """Control points at equal distances along packed splines, `new_count` for each.
-
-    A different curve, as its knots are elsewhere: close where the new knots are at least as dense
-    as the old ones.
-    """
-    t, spline = _even_parameters(control, count, arc_length_flat(control, count), new_count)
-    return evaluate_flat(control, count, t, spline)
-
-
-def resample(control: Float[Tensor, "C k"], new_count: int) -> Float[Tensor, "{new_count} k"]:
-    """Control points at `new_count` equal distances along a spline."""
-    count = torch.tensor([len(control)], device=control.device)
-    return resample_flat(control, count, torch.full_like(count, new_count))
 
 
 def _even_parameters(

@@ -72,7 +72,7 @@ def read_annotations(path: Path, points: SurveyedPoints) -> Annotations:
     )
 
 
-def write_road(path: Path, calibration: RoadCalibration) -> None:
+def write_rig_road(path: Path, calibration: RoadCalibration) -> None:
     """Writes the section `road` of a rig.yaml, or replaces it; everything else stays as it is."""
     try:
         text = path.read_text(encoding="utf-8")

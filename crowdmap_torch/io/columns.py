@@ -88,6 +88,13 @@ class Sheet:
         )
         return numbers
 
+    def flags(self, name: str) -> Bool[np.ndarray, " n"]:
+        """Whether each row is marked; a null and a missing column say that none is."""
+        column = self._column(name, pa.types.is_boolean, "bool", nullable=True)
+        if column is None:
+            return np.zeros(len(self), dtype=bool)
+        return np.array(column.fill_null(False).to_numpy(zero_copy_only=False))
+
     def strings(self, name: str, *, optional: bool = False) -> pa.StringArray:
         """Texts; where `optional`, nulls stand for unknown, and so does a missing column."""
         column = self._column(name, _is_text, "string", nullable=optional)
@@ -134,28 +141,25 @@ class Sheet:
             )
         return tuple(names)
 
-    def number_lists(self, name: str, count: int | None = None) -> Lists:
-        """Lists of finite numbers, `count` in each row if that is given."""
-        lists = self._number_lists(name, self._column(name, _is_number_list, "list<double>"))
+    def number_lists(self, name: str, count: int | None = None, *, optional: bool = False) -> Lists:
+        """Lists of finite numbers, `count` in each row if that is given; where `optional`, a row may have none."""
+        column = self._column(name, _is_number_list, "list<double>", nullable=optional)
+        if column is None:
+            return Lists(np.zeros(0), np.zeros(len(self), dtype=np.int64))
+        size = _lengths(column)
+        row = np.repeat(np.arange(len(self)), size)
+        lists = Lists(self._values(name, column.flatten(), row), size)
         if count is not None:
             self.refuse(
-                lists.count != count,
-                lambda row: f"column {name!r}: expected {count} numbers, found {lists.count[row]}",
+                column.is_valid().to_numpy(zero_copy_only=False) & (size != count),
+                lambda row: f"column {name!r}: expected {count} numbers, found {size[row]}",
             )
         return lists
 
     def points(self, name: str, *, optional: bool = False) -> Lists:
         """A point of three numbers in each row; where `optional`, `count` is 0 for none."""
-        column = self._column(name, _is_number_list, "list<double>", nullable=optional)
-        if column is None:
-            return Lists(np.zeros((0, 3)), np.zeros(len(self), dtype=np.int64))
-        known = column.is_valid().to_numpy(zero_copy_only=False)
-        lists = self._number_lists(name, column)
-        self.refuse(
-            known & (lists.count != 3),
-            lambda row: f"column {name!r}: expected 3 numbers, found {lists.count[row]}",
-        )
-        return Lists(lists.values.reshape(-1, 3), known.astype(np.int64))
+        lists = self.number_lists(name, 3, optional=optional)
+        return Lists(lists.values.reshape(-1, 3), lists.count // 3)
 
     def point_lists(self, name: str, *, optional: bool = False) -> Lists:
         """Lists of points of three numbers; where `optional`, a row may have none (`count` 0)."""
@@ -178,11 +182,6 @@ class Sheet:
             )
         values = self._values(name, inner.flatten(), np.repeat(row, 3))
         return Lists(values.reshape(-1, 3), count)
-
-    def _number_lists(self, name: str, column: pa.Array) -> Lists:
-        count = _lengths(column)
-        row = np.repeat(np.arange(len(self)), count)
-        return Lists(self._values(name, column.flatten(), row), count)
 
     def _values(
         self, name: str, flat: pa.Array, row: Int[np.ndarray, " p"]

@@ -7,7 +7,12 @@ from pathlib import Path
 
 import torch
 
-from crowdmap_torch.io.detections import DROPPED_LANE, DROPPED_SIGN, read_lanes, read_signs
+from crowdmap_torch.io.detections import (
+    DROPPED_LANE,
+    DROPPED_SIGN,
+    read_lane_detections,
+    read_sign_detections,
+)
 from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.poses import read_poses
@@ -57,10 +62,7 @@ def load_dataset(
         for journey, own in zip(journeys, names, strict=True)
     )
     return Dataset(
-        origin=origin,
-        journeys=tuple(recoded),
-        rejected=tuple(rejected),
-        type_names=all_names,
+        origin=origin, journeys=tuple(recoded), rejected=tuple(rejected), type_names=all_names
     )
 
 
@@ -86,14 +88,12 @@ def read_origin(head: Document) -> Origin:
     )
 
 
-def sign_row_count(journey: Journey) -> int:
-    """How many rows the journey's signs.parquet has, those dropped at the door included."""
-    return len(journey.signs) + _dropped_rows(journey, DROPPED_SIGN)
-
-
-def lane_row_count(journey: Journey) -> int:
-    """How many rows the journey's lanes.parquet has, those dropped at the door included."""
-    return len(journey.lanes) + _dropped_rows(journey, DROPPED_LANE)
+def row_count(journey: Journey, kind: str) -> int:
+    """How many rows the journey's file of `sign` or `lane` detections has, those dropped at the door included."""
+    detections = journey.signs if kind == "sign" else journey.lanes
+    prefix = DROPPED_SIGN if kind == "sign" else DROPPED_LANE
+    dropped = (count for reason, count in journey.dropped.items() if reason.startswith(prefix))
+    return len(detections) + sum(dropped)
 
 
 def _journey_folders(folder: Path) -> list[Path]:
@@ -128,8 +128,8 @@ def _load_journey(
         raise InputError(str(rig))
     poses = read_poses(folder / "poses.parquet")
     frame_number = poses.frame_number.numpy()
-    signs = read_signs(folder / "signs.parquet", rig.camera, frame_number)
-    lanes = read_lanes(folder / "lanes.parquet", rig.camera, frame_number)
+    signs = read_sign_detections(folder / "signs.parquet", rig.camera, frame_number)
+    lanes = read_lane_detections(folder / "lanes.parquet", rig.camera, frame_number)
     journey = Journey(
         journey_id=journey_id,
         rig=rig,
@@ -158,7 +158,3 @@ def _recode(journey: Journey, own: tuple[str, ...], names: tuple[str, ...]) -> J
 def _moved(journey: Journey, device: torch.device | str) -> Journey:
     # Left alone where it is there already: journeys with one rig share what its camera has computed.
     return journey if torch.device(device).type == "cpu" else journey.to(device)
-
-
-def _dropped_rows(journey: Journey, prefix: str) -> int:
-    return sum(count for reason, count in journey.dropped.items() if reason.startswith(prefix))

@@ -48,7 +48,9 @@ class LaneFile:
     dropped: dict[str, int]
 
 
-def read_signs(path: Path, camera: Camera, frame_number: Int[np.ndarray, " f"]) -> SignFile:
+def read_sign_detections(
+    path: Path, camera: Camera, frame_number: Int[np.ndarray, " f"]
+) -> SignFile:
     """The sign detections of a journey whose frames have the given numbers.
 
     A track number below zero counts as none: tracks are hints.
@@ -92,7 +94,9 @@ def read_signs(path: Path, camera: Camera, frame_number: Int[np.ndarray, " f"]) 
     )
 
 
-def read_lanes(path: Path, camera: Camera, frame_number: Int[np.ndarray, " f"]) -> LaneFile:
+def read_lane_detections(
+    path: Path, camera: Camera, frame_number: Int[np.ndarray, " f"]
+) -> LaneFile:
     """The lane detections of a journey whose frames have the given numbers.
 
     Points outside the image and points without a ray are left out and counted; the row goes with
@@ -102,8 +106,7 @@ def read_lanes(path: Path, camera: Camera, frame_number: Int[np.ndarray, " f"]) 
     frame = _frame_index(sheet, frame_number)
     u, v = _pixels(sheet)
     sheet.refuse(
-        u.count < 2,
-        lambda row: f"lane marker with {u.count[row]} points; expected 2 or more",
+        u.count < 2, lambda row: f"lane marker with {u.count[row]} points; expected 2 or more"
     )
     lane_type = sheet.codes("type", LANE_TYPES, optional=True)
     score = _score(sheet)
@@ -137,9 +140,7 @@ def read_lanes(path: Path, camera: Camera, frame_number: Int[np.ndarray, " f"]) 
             score=torch.from_numpy(score[order]),
         ),
         points=LanePoints(
-            detection=torch.from_numpy(place[u.row[points]]),
-            px=px[points],
-            ideal=ideal[points],
+            detection=torch.from_numpy(place[u.row[points]]), px=px[points], ideal=ideal[points]
         ),
         dropped=dropped_rows | dropped,
     )

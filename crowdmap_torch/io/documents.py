@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
+from torch import Tensor
 
 from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.io.errors import InputError, one_line
@@ -136,6 +140,21 @@ def write_json(path: Path, content: dict) -> None:
     text = json.dumps(content, indent=2, allow_nan=False)
     with atomic_file(path) as beside:
         beside.write_text(text + "\n", encoding="utf-8")
+
+
+def plain(value: object) -> Any:
+    """The same content in the types that JSON has: null for what is not finite, lists for tensors and tuples."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, Tensor | np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
 
 
 class _StrictLoader(yaml.SafeLoader):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class InputError(ValueError):
     """Input that breaks FORMAT.md; one line: where, what was expected, what found, what to do."""
@@ -10,3 +13,12 @@ class InputError(ValueError):
 def one_line(error: object) -> str:
     """The text of somebody else's error without line breaks."""
     return " ".join(str(error).split())
+
+
+@contextmanager
+def input_read() -> Iterator[None]:
+    """Inside, a value or a file that is wrong is wrong input: a ValueError or OSError leaves as an InputError."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise InputError(one_line(error)) from error

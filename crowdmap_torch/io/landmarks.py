@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.geometry import polygon, se3, spline
+from crowdmap_torch.geometry import polygon, se3, spline_length
 from crowdmap_torch.io.columns import Sheet
 from crowdmap_torch.io.rigs import UNIT_TOLERANCE
 from crowdmap_torch.io.writing import (
@@ -70,7 +70,7 @@ def write_lanes(path: Path, lanes: Lanes, lane_id: Sequence[str]) -> None:
     control = lanes.control.point_world.detach().cpu()
     count = lanes.control_count
     if len(lanes):
-        point, _, piece = spline.sample_flat(control, count, POINT_SPACING_M)
+        point, _, piece = spline_length.sample_flat(control, count, POINT_SPACING_M)
     else:
         point, piece = control, count
     write_parquet(
@@ -110,16 +110,12 @@ def read_signs(path: Path) -> tuple[Signs, tuple[str, ...], tuple[str, ...]]:
         size = torch.from_numpy(np.stack(given, axis=-1))
     names = sheet.strings("type", optional=True)
     type_names = tuple(sorted(name for name in names.unique().to_pylist() if name is not None))
-    none = torch.full((len(sheet),), -1, dtype=torch.int64)
     signs = Signs(
         shape=shape,
         type=torch.from_numpy(sheet.codes("type", type_names, optional=True)),
         T_world_sign=T_world_sign,
         size=size,
         covariance=_covariance(sheet),
-        journey=none,
-        tracklet=none,
-        frame=none,
         **_read_support(sheet),
     )
     return signs, sign_id, type_names
@@ -150,14 +146,10 @@ def read_lanes(path: Path) -> tuple[Lanes, tuple[str, ...]]:
             ),
         )
         sigma = sigmas.values
-    none = torch.full((len(sheet),), -1, dtype=torch.int64)
     lanes = Lanes(
         type=torch.from_numpy(sheet.codes("type", LANE_TYPES, optional=True)),
         control_start=torch.from_numpy(control.start),
         control_count=torch.from_numpy(control.count),
-        journey=none,
-        tracklet=none,
-        frame=none,
         **_read_support(sheet),
         control=ControlPoints(
             point_world=torch.from_numpy(control.values), sigma=torch.from_numpy(sigma)
@@ -265,6 +257,7 @@ def _support_columns(table: Signs | Lanes) -> dict[str, pa.Array]:
 
 
 def _read_support(sheet: Sheet) -> dict[str, Tensor]:
+    """Columns that signs and lanes share; which journey's tracklet a landmark was is not in a file."""
     counts = {
         name: torch.from_numpy(sheet.integers(name) if name in sheet else np.zeros(len(sheet), int))
         for name in _SUPPORT
@@ -275,14 +268,15 @@ def _read_support(sheet: Sheet) -> dict[str, Tensor]:
         lambda row: f"column 'confidence': expected 0 to 1, found {confidence[row]:g}",
     )
     confidence = np.where(np.isnan(confidence), 1.0, confidence)
-    return counts | {"confidence": torch.from_numpy(confidence)}
+    none = torch.full((len(sheet),), -1, dtype=torch.int64)
+    origin = {"journey": none, "tracklet": none, "frame": none}
+    return origin | counts | {"confidence": torch.from_numpy(confidence)}
 
 
 def _positive(sheet: Sheet, name: str) -> Float[np.ndarray, " n"]:
     values = sheet.numbers(name)
     sheet.refuse(
-        values <= 0,
-        lambda row: f"column {name!r}: expected a number above 0, found {values[row]}",
+        values <= 0, lambda row: f"column {name!r}: expected a number above 0, found {values[row]}"
     )
     return values
 

@@ -1,21 +1,59 @@
-"""Maps on disk: a folder with `map.json`, signs and lanes (FORMAT.md), complete or not there."""
+"""Maps as FORMAT.md has them: made of what the mapper found, and on disk, a folder complete or not there."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io.atomic import atomic_folder
 from crowdmap_torch.io.datasets import read_origin
 from crowdmap_torch.io.documents import Document, read_json, write_json
 from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.landmark_ids import lane_ids, sign_ids
 from crowdmap_torch.io.landmarks import read_lanes, read_signs, write_lanes, write_signs
-from crowdmap_torch.tables import HdMap
+from crowdmap_torch.tables import Association, Dataset, HdMap, Lanes, Signs, concatenate
 
 MAP_FORMAT = "crowdmap-map"
 MIN_CONFIDENCE = 0.5
 """Signs that are less probable than this are tentative."""
+
+
+def as_map(
+    dataset: Dataset,
+    signs: Signs,
+    lanes: Lanes,
+    tentative: Signs,
+    associations: Sequence[Association],
+    shared: Float[Tensor, "3 3"],
+    provenance: dict,
+) -> HdMap:
+    """Signs and lanes with their identifiers, corners in the order of FORMAT.md, tentative signs behind the others."""
+    every = concatenate([signs, tentative])
+    journeys = dataset.journeys
+    T_world_sign, size = polygon.canonical(every.T_world_sign, every.size, every.shape)
+    return HdMap(
+        origin=dataset.origin,
+        signs=replace(every, T_world_sign=T_world_sign, size=size),
+        lanes=lanes,
+        sign_id=sign_ids(journeys, associations, every),
+        lane_id=lane_ids(journeys, associations, lanes),
+        type_names=dataset.type_names,
+        shared_covariance=shared,
+        provenance=provenance,
+    )
+
+
+def certain_part(hd_map: HdMap, min_confidence: float) -> HdMap:
+    """The map without its tentative signs: what readers of signs.parquet see."""
+    kept = torch.nonzero(hd_map.signs.confidence >= min_confidence)[:, 0]
+    names = tuple(hd_map.sign_id[row] for row in kept.tolist())
+    return replace(hd_map, signs=hd_map.signs[kept], sign_id=names)
 
 
 def write_map(hd_map: HdMap, path: Path | str, *, min_confidence: float = MIN_CONFIDENCE) -> None:
@@ -31,17 +69,12 @@ def write_map(hd_map: HdMap, path: Path | str, *, min_confidence: float = MIN_CO
             ids = [hd_map.sign_id[row] for row in rows.tolist()]
             write_signs(folder / f"{name}.parquet", signs[rows], ids, hd_map.type_names)
         write_lanes(folder / "lanes.parquet", hd_map.lanes, hd_map.lane_id)
-        origin = hd_map.origin
         write_json(
             folder / "map.json",
             {
                 "format": MAP_FORMAT,
                 "version": 1,
-                "origin": {
-                    "lat_deg": origin.lat_deg,
-                    "lon_deg": origin.lon_deg,
-                    "height_m": origin.height_m,
-                },
+                "origin": asdict(hd_map.origin),
                 "shared_covariance": hd_map.shared_covariance.detach().cpu().flatten().tolist(),
                 "provenance": hd_map.provenance,
             },

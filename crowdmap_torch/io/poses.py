@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -82,7 +81,7 @@ def write_poses(path: Path, poses: LinkPoses) -> None:
         columns |= {name: sigma[:, k] for k, name in enumerate(_SIGMA_POSITION)}
     if poses.sigma_rotation is not None:
         columns[_SIGMA_ROTATION] = poses.sigma_rotation.detach().cpu().to(torch.float64).numpy()
-    write_parquet(path, {name: pa.array(column) for name, column in columns.items()})
+    write_parquet(path, columns)
 
 
 def _increasing(sheet: Sheet, name: str) -> Int[np.ndarray, " f"]:

@@ -1,9 +1,8 @@
-"""What a run writes beside its map: refined poses, the road, associations, metrics (FORMAT.md)."""
+"""What a run writes beside its map: refined poses, the road, associations (FORMAT.md)."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.io.datasets import lane_row_count, sign_row_count
-from crowdmap_torch.io.documents import write_json
+from crowdmap_torch.io.datasets import row_count
 from crowdmap_torch.io.poses import LinkPoses, write_poses
 from crowdmap_torch.io.writing import name_column, write_parquet
 from crowdmap_torch.tables import Journey, RoadEstimate
@@ -43,16 +41,15 @@ def write_refined_poses(
     write_poses(path, poses)
 
 
-def write_road(path: Path, frame_number: Int[Tensor, " f"], road: RoadEstimate) -> None:
+def write_road_estimate(path: Path, frame_number: Int[Tensor, " f"], road: RoadEstimate) -> None:
     """Writes the road under the car in every frame: normal (camera), height [m], sigma [rad]."""
     normal, height, sigma = (
         column.detach().cpu().to(torch.float64).numpy()
         for column in (road.normal_camera, road.height, road.sigma)
     )
-    columns = {"frame": pa.array(frame_number.cpu().numpy())}
-    columns |= {f"n{axis}": pa.array(normal[:, k]) for k, axis in enumerate("xyz")}
-    columns |= {"height_m": pa.array(height), "sigma": pa.array(sigma)}
-    write_parquet(path, columns)
+    axes = {f"n{axis}": normal[:, k] for k, axis in enumerate("xyz")}
+    frame = frame_number.cpu().numpy()
+    write_parquet(path, {"frame": frame, **axes, "height_m": height, "sigma": sigma})
 
 
 def write_associations(
@@ -81,13 +78,6 @@ def write_associations(
     write_parquet(path, dict(zip(table.column_names, table.columns, strict=True)))
 
 
-def write_metrics(path: Path, metrics: Mapping[str, object]) -> None:
-    """Writes metrics.json; a number that is not finite becomes null, tensors become lists."""
-    content = _plain(metrics)
-    assert isinstance(content, dict)
-    write_json(path, content)
-
-
 _NO_ASSOCIATIONS = pa.table(
     {
         "journey_id": pa.array([], pa.string()),
@@ -110,7 +100,7 @@ def _associations(
             f"journey {journey.journey_id!r}: {len(landmark)} {kind} landmarks for {len(row)} "
             "detections; expected one for each"
         )
-    rows = sign_row_count(journey) if kind == "sign" else lane_row_count(journey)
+    rows = row_count(journey, kind)
     code = np.full(rows, -1)
     code[row.cpu().numpy()] = landmark.cpu().numpy()
     return pa.table(
@@ -122,16 +112,3 @@ def _associations(
         },
         schema=_NO_ASSOCIATIONS.schema,
     )
-
-
-def _plain(value: object) -> object:
-    """The same content in the types that JSON has."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, Tensor | np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value

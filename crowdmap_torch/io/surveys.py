@@ -45,8 +45,7 @@ def _read_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
     centers = sheet.points("center", optional=True)
     has_center = centers.count > 0
     sheet.refuse(
-        ~has_corners & ~has_center,
-        lambda row: "neither corners nor a center; expected one of them",
+        ~has_corners & ~has_center, lambda row: "neither corners nor a center; expected one of them"
     )
     center = center_of(corners, polygon.corner_mask(shape)).numpy()
     # Corners are the better witness: where they are known the centre is their mean.

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.io.columns import Sheet
 from crowdmap_torch.tables import Journey, Rows, Survey
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -91,12 +91,9 @@ def read_truth(survey_folder: Path, survey: Survey, journeys: Sequence[Journey])
 
 def _read_journey_truth(folder: Path, survey: Survey, journey: Journey) -> JourneyTruth:
     like = journey.T_world_camera
-    poses = _read(folder / "poses.parquet", ("frame", *_POSE))
-    pose = _floats(poses, _POSE)[_rows_of_frames(folder / "poses.parquet", poses, journey)]
+    pose = _of_frames(folder / "poses.parquet", _POSE, journey)
     T_world_link = se3.make(se3.from_quaternion(pose[:, 3:]), pose[:, :3]).to(like)
-    road = _read(folder / "road.parquet", ("frame", "nx", "ny", "nz", "height_m"))
-    plane = _floats(road, ("nx", "ny", "nz", "height_m"))
-    plane = plane[_rows_of_frames(folder / "road.parquet", road, journey)].to(like)
+    plane = _of_frames(folder / "road.parquet", ("nx", "ny", "nz", "height_m"), journey).to(like)
     sign, outlier = _read_labels(folder / "signs.parquet", "sign_id", survey.sign_id)
     lane, _ = _read_labels(folder / "lanes.parquet", "lane_id", survey.lane_id)
     frame = torch.full((len(sign),), -1, dtype=torch.int64)
@@ -119,61 +116,43 @@ def _read_journey_truth(folder: Path, survey: Survey, journey: Journey) -> Journ
     )
 
 
-def _read(path: Path, columns: Sequence[str]) -> pa.Table:
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise ValueError(f"{path}: cannot be read as Parquet ({error})") from error
-    missing = [c for c in columns if c not in table.column_names]
-    if missing:
-        raise ValueError(f"{path}: expected columns {', '.join(columns)}; {missing[0]} is missing")
-    return table
-
-
-def _floats(table: pa.Table, columns: Sequence[str]) -> Float[Tensor, "n k"]:
-    values = [table.column(c).to_numpy().astype(np.float64) for c in columns]
-    return torch.as_tensor(np.stack(values, axis=-1))
-
-
-def _rows_of_frames(path: Path, table: pa.Table, journey: Journey) -> Int[Tensor, " f"]:
-    """Rows of the table in the order of the journey's frames."""
-    frame = torch.as_tensor(table.column("frame").to_numpy().astype(np.int64))
+def _of_frames(path: Path, columns: Sequence[str], journey: Journey) -> Float[Tensor, "f k"]:
+    """Columns of a file with a row for each frame, in the order of the journey's frames."""
+    sheet = Sheet(path, ("frame", *columns))
+    values = torch.from_numpy(np.stack([sheet.numbers(name) for name in columns], axis=-1))
+    frame = torch.from_numpy(sheet.integers("frame"))
     order = frame.argsort()
     wanted = journey.frame_number.cpu()
     place = torch.searchsorted(frame[order], wanted).clamp_max(max(len(frame) - 1, 0))
     if len(wanted) and (len(frame) == 0 or not bool((frame[order][place] == wanted).all())):
-        raise ValueError(f"{path}: frames of journey {journey.journey_id} are missing")
-    return order[place]
+        raise sheet.fault(f"frames of journey {journey.journey_id} are missing")
+    return values[order[place]]
 
 
 def _read_labels(
     path: Path, column: str, ids: Sequence[str]
 ) -> tuple[Int[Tensor, " r"], Bool[Tensor, " r"]]:
     """For each row of a detection file what it shows (-1 none), and whether it is an outlier."""
-    table = _read(path, ("row", column))
-    row = torch.as_tensor(table.column("row").to_numpy().astype(np.int64))
-    label = index_in(table.column(column), ids)
-    unknown = torch.as_tensor(table.column(column).is_valid().to_numpy()) & (label < 0)
-    if bool(unknown.any()):
-        first = int(unknown.nonzero()[0, 0])
-        name = table.column(column)[first].as_py()
-        raise ValueError(f"{path}: row {first}: {column} {name!r} is not in the survey")
+    sheet = Sheet(path, ("row", column), ("outlier",))
+    row = torch.from_numpy(sheet.integers("row"))
+    names = sheet.strings(column, optional=True)
+    label = index_in(names, ids)
+    sheet.refuse(
+        names.is_valid().to_numpy(zero_copy_only=False) & (label < 0).numpy(),
+        lambda at: f"{column} {names[at].as_py()!r} is not in the survey",
+    )
     rows = int(row.max()) + 1 if len(row) else 0
-    outlier = torch.zeros(len(row), dtype=torch.bool)
-    if "outlier" in table.column_names:
-        outlier = torch.as_tensor(table.column("outlier").to_numpy().astype(bool))
+    outlier = torch.from_numpy(sheet.flags("outlier"))
     return (
         torch.full((rows,), -1, dtype=torch.int64).index_put((row,), label),
         torch.zeros(rows, dtype=torch.bool).index_put((row,), outlier),
     )
 
 
-def index_in(column: pa.ChunkedArray, ids: Sequence[str]) -> Int[Tensor, " n"]:
-    """The index in `ids` of each string of a column; -1 for null and for other strings."""
+def index_in(names: pa.StringArray, ids: Sequence[str]) -> Int[Tensor, " n"]:
+    """The index in `ids` of each string; -1 for null and for other strings."""
     place = {name: index for index, name in enumerate(ids)}
-    encoded = column.combine_chunks().dictionary_encode()
-    if isinstance(encoded, pa.ChunkedArray):
-        encoded = encoded.combine_chunks()
+    encoded = names.dictionary_encode()
     code = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
     # One entry more for null, which has the code -1.
     of_code = [place.get(name, -1) for name in encoded.dictionary.to_pylist()]
@@ -193,10 +172,10 @@ class SignAssociations(Rows):
 
 def read_associations(path: Path, journey_ids: Sequence[str]) -> SignAssociations:
     """The sign rows of RUN/associations.parquet that are in a landmark, of the journeys named."""
-    table = _read(path, ("journey_id", "kind", "row", "landmark_id"))
-    journey = index_in(table.column("journey_id"), journey_ids)
-    names = table.column("landmark_id")
+    sheet = Sheet(path, ("journey_id", "kind", "row", "landmark_id"))
+    journey = index_in(sheet.strings("journey_id"), journey_ids)
+    names = sheet.strings("landmark_id", optional=True)
     landmark = index_in(names, [name for name in names.unique().to_pylist() if name is not None])
-    row = torch.as_tensor(table.column("row").to_numpy().astype(np.int64))
-    is_sign = index_in(table.column("kind"), ("sign",)) == 0
+    row = torch.from_numpy(sheet.integers("row"))
+    is_sign = index_in(sheet.strings("kind"), ("sign",)) == 0
     return SignAssociations(journey, row, landmark)[is_sign & (journey >= 0) & (landmark >= 0)]

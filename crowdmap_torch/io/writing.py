@@ -12,8 +12,10 @@ from jaxtyping import Float, Int
 
 from crowdmap_torch.io.atomic import atomic_file
 
+Column = pa.Array | pa.ChunkedArray | np.ndarray
 
-def write_parquet(path: Path, columns: Mapping[str, pa.Array | pa.ChunkedArray]) -> None:
+
+def write_parquet(path: Path, columns: Mapping[str, Column]) -> None:
     """Writes one Parquet file; it is complete or not there."""
     with atomic_file(path) as beside:
         pq.write_table(pa.table(dict(columns)), beside)
@@ -26,9 +28,7 @@ def name_column(code: Int[np.ndarray, " n"], names: Sequence[str]) -> pa.Array:
 
 
 def list_column(
-    values: Float[np.ndarray, " p"],
-    count: Int[np.ndarray, " n"],
-    kind: pa.DataType | None = None,
+    values: Float[np.ndarray, " p"], count: Int[np.ndarray, " n"], kind: pa.DataType | None = None
 ) -> pa.ListArray:
     """Flat values as lists of `count` each, of float64 unless `kind` says otherwise."""
     return pa.ListArray.from_arrays(_offsets(count), pa.array(values, kind or pa.float64()))

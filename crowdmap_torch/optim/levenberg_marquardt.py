@@ -14,21 +14,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.linear import (
-    Backend,
-    DenseBackend,
-    NormalEquations,
-    ReusableEquations,
-    Step,
-)
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
+from crowdmap_torch.optim.solvers.dense import DenseBackend
+from crowdmap_torch.optim.solvers.normal_equations import Backend, NormalEquations, Tangents
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
 _NEAR_BEST = 0.2
-"""Steps that should be longer or shorter by less than this share stay as they are ..."""
-_NEAR_ENOUGH = (0.5, 1.8)
-"""... and those with a kept matrix that should be within these multiples: the next one learns from what is left."""
+"""Steps that should be longer or shorter by less than this share stay as they are."""
 REASONS = (
     "still running",
     "converged: the cost no longer falls",
@@ -58,28 +51,6 @@ class LmConfig:
     max_stretch: float = 1.0
     """Longest that an accepted step may be made, as a multiple, where the model proved wrong about its length: the
     weights of robust losses overrate the curvature. 1: never; a change costs one more evaluation of the cost."""
-    reuse_below: float = 0.0
-    """Once a step lowers the cost by less than this share, the factorised matrix is kept for the steps that follow, at a
-    third of the price: limited-memory BFGS that starts from it and learns from the gradients what it has wrong. 0: never."""
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where steps with a kept matrix came by."""
-
-    normal: ReusableEquations
-    newton: Mapping[str, Tensor]
-    """The step there by the kept matrix."""
-    step: Mapping[str, Tensor]
-    """The step that was taken from there."""
-    length: Tensor
-    """What multiple of the step proposed it is."""
-
-
-_Course = tuple[_Place, ...]
-"""The last places, oldest first."""
-_MEMORY = 3
-"""Most places that are remembered."""
 
 
 @dataclass(frozen=True)
@@ -95,15 +66,16 @@ class LmState:
     gain_ratio: Float[Tensor, " groups"]
     """Decrease of the cost over the decrease that the model predicted, of the last step."""
     step_norm: Float[Tensor, " groups"]
+    stretch: Float[Tensor, " groups"]
+    """What multiple of the step that was proposed last counts."""
     accepted: Bool[Tensor, " groups"]
     """Whether the last step was taken."""
     reason: Int[Tensor, " groups"]
     """Index into `REASONS`."""
     normal: NormalEquations | None = field(default=None, repr=False)
-    """Normal equations at the values; None where they moved since, or the problem changed. On a course: the gradient
-    there, and the matrix that is kept."""
-    course: _Course = field(default=(), repr=False)
-    """Where the matrix is kept: the way since it was factorised."""
+    """Normal equations at the values; None where they moved since, or the problem changed."""
+    proposed: Tangents | None = field(default=None, repr=False)
+    """The last step as the normal equations gave it, before it was stretched or rejected."""
     iterations: int = 0
     linearizations: int = 0
 
@@ -131,6 +103,7 @@ def init(problem: Problem, values: Values, config: LmConfig) -> LmState:
         term_cost=term_cost,
         gain_ratio=nothing,
         step_norm=nothing,
+        stretch=torch.ones_like(cost),
         accepted=torch.zeros_like(cost, dtype=torch.bool),
         reason=torch.where(cost.isfinite(), RUNNING, NOT_FINITE),
     )
@@ -140,8 +113,6 @@ def step(
     problem: Problem, state: LmState, config: LmConfig, *, backend: Backend | None = None
 ) -> LmState:
     """The state after one step: each problem that is still running moves, or raises its damping."""
-    if state.course:
-        return _step_on_course(problem, state, config)
     normal = state.normal
     if normal is None:
         normal = (backend or DenseBackend()).assemble(problem, state.values)
@@ -177,13 +148,8 @@ def step(
     reason[running & ~accepted & (damping > config.max_damping) & (reason == RUNNING)] = STALLED
 
     moved = bool(accepted.any())
-    course: _Course = ()
-    keeps = bool((decrease <= config.reuse_below * normal.cost).all())
-    if moved and keeps and isinstance(normal, ReusableEquations):
-        course = (_Place(normal, proposal.delta, _scaled(problem, proposal.delta, length), length),)
     return replace(
         state,
-        course=course,
         values=_merge(problem, state.values, candidate, accepted) if moved else state.values,
         damping=damping,
         growth=growth,
@@ -194,108 +160,14 @@ def step(
         },
         gain_ratio=torch.where(running, gain, state.gain_ratio),
         step_norm=torch.where(running, proposal.norm, state.step_norm),
+        stretch=length,
         accepted=accepted,
         reason=reason,
         # After a rejected step the linearisation still holds.
         normal=None if moved else normal,
+        proposed=proposal.delta,
         iterations=state.iterations + 1,
     )
-
-
-def _step_on_course(problem: Problem, state: LmState, config: LmConfig) -> LmState:
-    """A step with the matrix kept: the gradient where it leads tells its length, and serves the next."""
-    course, normal = state.course, state.normal
-    if normal is None:
-        normal = course[-1].normal.moved(problem, state.values)
-    assert isinstance(normal, ReusableEquations)
-    newton = normal.solve(state.damping)
-    proposal = _quasi_newton(course, normal, newton)
-    slope = normal.slope(proposal.delta)
-    # What the kept matrix has wrong about lengths it has wrong again.
-    length = course[-1].length
-    candidate, there = _look(problem, state.values, normal, proposal.delta, length)
-    curvature = (there.slope(proposal.delta) - slope) / (-slope * length)
-    best = 1 / curvature.clamp_min(1 / config.max_stretch)
-    low, high = _NEAR_ENOUGH
-    is_near = (best > low * length) & (best < high * length)
-    if config.max_stretch > 1 and not bool(is_near.all()):
-        other, there_too = _look(problem, state.values, normal, proposal.delta, best)
-        if bool((there_too.cost < there.cost).all()):
-            candidate, there, length = other, there_too, best
-    decrease = normal.cost - there.cost
-    state = replace(state, iterations=state.iterations + 1, normal=None, course=())
-    if not bool(((decrease > 0) & proposal.solved & there.cost.isfinite()).all()):
-        # The kept matrix no longer serves: linearise here, and judge by that.
-        return replace(state, accepted=torch.zeros_like(state.accepted))
-    keeps = bool((decrease <= config.reuse_below * normal.cost).all())
-    if keeps:
-        place = _Place(normal, newton.delta, _scaled(problem, proposal.delta, length), length)
-        state = replace(state, course=(*course, place)[-_MEMORY:], normal=there)
-    done = (decrease <= config.cost_tolerance * normal.cost) & (state.reason == RUNNING)
-    return replace(
-        state,
-        values=candidate,
-        cost=there.cost,
-        term_cost=there.term_cost,
-        gain_ratio=decrease / proposal.predicted,
-        step_norm=proposal.norm,
-        accepted=torch.ones_like(state.accepted),
-        reason=torch.where(done, CONVERGED_COST, state.reason),
-    )
-
-
-def _look(
-    problem: Problem,
-    values: Values,
-    normal: ReusableEquations,
-    delta: Mapping[str, Tensor],
-    length: Tensor,
-) -> tuple[dict[str, Tensor], ReusableEquations]:
-    """Values at a multiple of the step, with cost and gradient there."""
-    candidate = retract(problem, values, _scaled(problem, delta, length))
-    return candidate, normal.moved(problem, candidate)
-
-
-def _quasi_newton(course: _Course, normal: ReusableEquations, newton: Step) -> Step:
-    """The step of limited-memory BFGS from the kept matrix and the way since (Nocedal and Wright 2006, algorithm 7.4).
-
-    The kept matrix's inverse times a difference of gradients is the difference of its own steps, so that nothing is
-    solved but the `newton` step here; and the step sought is a sum of steps that are there, so that the recursion is
-    one of their shares, by the derivatives of the cost along each of them at every place.
-    """
-    newtons = [place.newton for place in course] + [newton.delta]
-    spans = [place.step for place in course] + newtons
-    count = len(course)
-    slope = torch.stack(
-        [
-            torch.stack([there.slope(along) for along in spans]).flatten()
-            for there in [*(place.normal for place in course), normal]
-        ]
-    ).cpu()
-    bend = slope[1:] - slope[:-1]
-    """Change of the derivatives over each step that was taken."""
-    turns = bend[:, :count].diagonal()
-    learnt = torch.nonzero(turns > 0)[:, 0].tolist()
-    share = torch.zeros_like(slope[0])
-    share[-1] = 1
-    weight = torch.zeros_like(turns)
-    for i in reversed(learnt):
-        weight[i] = (slope[-1, i] - weight @ bend[:, i]) / turns[i]
-        share[count + i + 1] -= weight[i]
-        share[count + i] += weight[i]
-    if learnt:
-        last = learnt[-1]
-        by_matrix = bend[last, count + last] - bend[last, count + last + 1]
-        share *= turns[last] / by_matrix
-    for i in learnt:
-        share[i] -= weight[i] + bend[i] @ share / turns[i]
-    if not slope[-1] @ share < slope[-1, -1] / 10:
-        return newton
-    direction = {name: torch.zeros_like(tangent) for name, tangent in newton.delta.items()}
-    for part, delta in zip(share.tolist(), spans, strict=True):
-        for name, tangent in direction.items():
-            tangent.add_(delta[name], alpha=part)
-    return replace(newton, delta=direction, predicted=-normal.slope(direction) / 2)
 
 
 _Trial = tuple[dict[str, Tensor], dict[str, Tensor], Tensor]
@@ -337,7 +209,7 @@ def _better(problem: Problem, first: _Trial, second: _Trial) -> _Trial:
 def changed(state: LmState) -> LmState:
     """The state for a problem that changed (matches refreshed, scales narrowed): linearised anew, running again."""
     reason = torch.where(state.reason == NOT_FINITE, state.reason, RUNNING)
-    return replace(state, normal=None, course=(), reason=reason)
+    return replace(state, normal=None, reason=reason)
 
 
 def solve(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,22 +10,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import jacfwd, vmap
 
-from crowdmap_torch.optim.parallel import in_order
-from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
+from crowdmap_torch.optim.problem import (
+    CostTerm,
+    Follows,
+    Jacobian,
+    Problem,
+    SparseJacobian,
+    Values,
+    Variable,
+)
 from crowdmap_torch.optim.robust import JointLoss
+from crowdmap_torch.optim.threads import in_order
 
 CHUNK_ROWS = 1 << 14
 """Rows that are linearised at once; bounds the memory, whatever the size of the problem."""
-
-
-@dataclass(frozen=True)
-class LinearRows:
-    """Rows of a term, whitened: residuals, one Jacobian per slot, and the robust weights."""
-
-    residual: Float[Tensor, "m d"]
-    jacobians: tuple[Float[Tensor, "m d _"], ...]
-    robust_weight: Float[Tensor, " m"]
-    rho: Float[Tensor, " m"]
 
 
 def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
@@ -55,32 +53,41 @@ def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:
     """Whitened residuals of all rows."""
     if not len(term):
         return torch.zeros(0, 1, dtype=next(iter(values.values())).dtype)
-    blocks = [values[name][block] for name, block in term.slots]
-    batched = term.batched or vmap(term.residual)
-    return _whiten(term, batched(*blocks, *term.constants))
+    evaluate = term.residual
+    if term.jacobian is None:
+        evaluate = vmap(evaluate, in_dims=-1, out_dims=-1)
+    residual = evaluate(*_arguments(term, values))
+    return (residual if term.weight is None else residual * _scale(term.weight)).mT.contiguous()
 
 
-def linearize(term: CostTerm, variables: dict[str, Variable], values: Values) -> LinearRows:
+@dataclass(frozen=True)
+class LinearRows:
+    """Rows of a term, whitened: residuals, one Jacobian per slot, and the robust weights.
+
+    The rows are the last axis: the blocks are small and the rows many, so that every operation runs along the rows.
+    """
+
+    residual: Float[Tensor, "d m"]
+    jacobians: tuple[Float[Tensor, "d _ m"], ...]
+    robust_weight: Float[Tensor, " m"]
+    rho: Float[Tensor, " m"]
+
+
+def linearize(term: CostTerm, variables: Mapping[str, Variable], values: Values) -> LinearRows:
     """Whitened residuals and Jacobians of all rows at zero tangent, with the loss's weights."""
-    blocks = [values[name][block] for name, block in term.slots]
-    if term.jacobian is not None:
-        residual, jacobians = term.jacobian(*blocks, *term.constants)
-    else:
-        residual, jacobians = autograd_jacobians(term, variables, values)
+    residual, jacobians = _jacobians(term, variables, values)
+    jacobians = dense(jacobians)
     if term.weight is not None:
-        scale = term.weight if term.weight.ndim == 2 else term.weight[:, None]
+        scale = _scale(term.weight)
         residual = residual * scale
-        jacobians = tuple(J * scale[..., None] for J in jacobians)
-    s = residual.square().sum(-1)
+        jacobians = tuple(J * scale.unsqueeze(-2) for J in jacobians)
+    s = residual.square().sum(0)
     return LinearRows(residual, jacobians, term.loss.weight(s), term.loss.rho(s))
 
 
 @dataclass(frozen=True)
 class RowGradients:
-    """Every row's loss and gradient, by slot, with the rows as the last axis.
-
-    Rows last: the blocks are small and the rows many, so that every operation runs along the rows.
-    """
+    """Every row's loss and gradient, by slot, with the rows as the last axis."""
 
     rho: Float[Tensor, " m"]
     gradient: tuple[Float[Tensor, "_ m"], ...]
@@ -95,74 +102,143 @@ class RowBlocks(RowGradients):
     """`J_i^T W J_j` of every two slots i <= j."""
 
 
-def row_blocks(term: CostTerm, variables: dict[str, Variable], values: Values) -> RowBlocks:
-    """Every row's gradient and Hessian blocks, by the term's own function or from its Jacobians."""
-    if term.normal is not None:
-        blocks = tuple(values[name][block] for name, block in term.slots)
-        return term.normal(blocks, term.constants, term.weight, term.loss)
-    linear = linearize(term, variables, values)
-    return blocks_of_jacobians(
-        linear.residual.mT,
-        tuple(J.permute(1, 2, 0) for J in linear.jacobians),
-        linear.robust_weight,
-        linear.rho,
-    )
+def row_blocks(term: CostTerm, variables: Mapping[str, Variable], values: Values) -> RowBlocks:
+    """Every row's gradient and Hessian blocks."""
+    residual, jacobians, weight, rho = _weighted(term, variables, values)
+    hessian: dict[tuple[int, int], Tensor] = {}
+    for i, J in enumerate(jacobians):
+        pulling = J if isinstance(J, Follows) else _weighted_rows(J, weight)
+        for j, other in enumerate(jacobians[i:], i):
+            if isinstance(pulling, Follows):
+                block = hessian[0, j][: pulling.columns] * pulling.factor
+            elif isinstance(other, Follows):
+                block = hessian[0, i].transpose(0, 1)[:, : other.columns] * other.factor
+            else:
+                block = _product(pulling, other)
+            hessian[i, j] = block
+    return RowBlocks(rho, _pulled(jacobians, residual * weight), hessian)
 
 
-def row_gradients(term: CostTerm, variables: dict[str, Variable], values: Values) -> RowGradients:
-    """Every row's gradient, by the term's own function or from its blocks."""
-    if term.gradient is None:
-        return row_blocks(term, variables, values)
-    blocks = tuple(values[name][block] for name, block in term.slots)
-    return term.gradient(blocks, term.constants, term.weight, term.loss)
+def row_gradients(
+    term: CostTerm, variables: Mapping[str, Variable], values: Values
+) -> RowGradients:
+    """Every row's gradient alone."""
+    residual, jacobians, weight, rho = _weighted(term, variables, values)
+    return RowGradients(rho, _pulled(jacobians, residual * weight))
 
 
-def blocks_of_jacobians(
-    residual: Float[Tensor, "d m"],
-    jacobians: tuple[Float[Tensor, "d _ m"], ...],
-    robust_weight: Float[Tensor, " m"],
-    rho: Float[Tensor, " m"],
-) -> RowBlocks:
-    """Blocks of whitened residuals and Jacobians, rows last."""
-    jacobians = tuple(J.contiguous() for J in jacobians)
-    weighted = tuple(J * robust_weight for J in jacobians)
-    return RowBlocks(
-        rho,
-        tuple(sum_of_products(J, residual[:, None]).squeeze(1) for J in weighted),
-        {
-            (i, j): sum_of_products(weighted[i], jacobians[j])
-            for i in range(len(jacobians))
-            for j in range(i, len(jacobians))
-        },
-    )
+def dense(jacobians: tuple[Jacobian, ...]) -> tuple[Float[Tensor, "d _ m"], ...]:
+    """All entries of the Jacobians of a term."""
+    whole: list[Tensor] = []
+    for J in jacobians:
+        if isinstance(J, Follows):
+            J = whole[0][:, : J.columns] * J.factor
+        whole.append(J.dense() if isinstance(J, SparseJacobian) else J)
+    return tuple(whole)
 
 
-def sum_of_products(a: Float[Tensor, "d k m"], b: Float[Tensor, "d l m"]) -> Float[Tensor, "k l m"]:
-    """`a^T b` of every row, rows last."""
+def sum_of_products(
+    a: Float[Tensor, "d k *#m"], b: Float[Tensor, "d l *#m"]
+) -> Float[Tensor, "k l *#m"]:
+    """`a^T b`, of every row where rows are the last axis."""
     total = a[0, :, None] * b[0]
     for i in range(1, len(a)):
         total.addcmul_(a[i, :, None], b[i])
     return total
 
 
+def _pulled(
+    jacobians: tuple[Jacobian, ...], pull: Float[Tensor, "d m"]
+) -> tuple[Float[Tensor, "_ m"], ...]:
+    """`J^T pull` of every slot."""
+    gradient: list[Tensor] = []
+    for J in jacobians:
+        if isinstance(J, Follows):
+            gradient.append(gradient[0][: J.columns] * J.factor)
+        else:
+            gradient.append(_product(J, pull[:, None])[:, 0])
+    return tuple(gradient)
+
+
+def _product(a: Tensor | SparseJacobian, b: Tensor | SparseJacobian) -> Float[Tensor, "k l m"]:
+    """`a^T b` of every row, without what is known to be zero."""
+    if isinstance(a, Tensor) and isinstance(b, Tensor):
+        return sum_of_products(a, b)
+    (width, of_a), (height, of_b) = _entries(a), _entries(b)
+    total = of_a[0][1].new_zeros(width, height, of_a[0][1].shape[-1])
+    for (i, x), (j, y) in zip(of_a, of_b, strict=True):
+        total[i : i + len(x), j : j + len(y)].addcmul_(x[:, None], y)
+    return total
+
+
+def _entries(J: Tensor | SparseJacobian) -> tuple[int, Sequence[tuple[int, Tensor]]]:
+    """The number of columns, and by row of the residual the first column and the entries from there on."""
+    return (
+        (J.columns, J.rows) if isinstance(J, SparseJacobian) else (J.shape[1], [(0, x) for x in J])
+    )
+
+
+def _weighted_rows(
+    J: Tensor | SparseJacobian, weight: Float[Tensor, "#d m"]
+) -> Tensor | SparseJacobian:
+    """A Jacobian times the weights of the residual's entries."""
+    if isinstance(J, Tensor):
+        return J * weight.unsqueeze(-2)
+    each = weight.expand(len(J.rows), -1)
+    rows = tuple((i, x * w) for (i, x), w in zip(J.rows, each, strict=True))
+    return SparseJacobian(J.columns, rows)
+
+
+def _weighted(
+    term: CostTerm, variables: Mapping[str, Variable], values: Values
+) -> tuple[Float[Tensor, "d m"], tuple[Jacobian, ...], Float[Tensor, "#d m"], Float[Tensor, " m"]]:
+    """Residuals and Jacobians, not whitened, the weights W of their squares, and the rows' losses."""
+    residual, jacobians = _jacobians(term, variables, values)
+    scale = residual.new_ones(1, 1) if term.weight is None else _scale(term.weight)
+    s = (residual * scale).square().sum(0)
+    return residual, jacobians, scale.square() * term.loss.weight(s), term.loss.rho(s)
+
+
+def _jacobians(
+    term: CostTerm, variables: Mapping[str, Variable], values: Values
+) -> tuple[Float[Tensor, "d m"], tuple[Jacobian, ...]]:
+    """Residuals and one Jacobian per slot, not whitened, in the term's closed form or by autograd."""
+    if term.jacobian is None:
+        return autograd_jacobians(term, variables, values)
+    residual, jacobians = term.jacobian(*_arguments(term, values))
+    return residual, jacobians[: len(term.slots)]
+
+
 def autograd_jacobians(
-    term: CostTerm, variables: dict[str, Variable], values: Values
-) -> tuple[Float[Tensor, "m d"], tuple[Float[Tensor, "m d _"], ...]]:
+    term: CostTerm, variables: Mapping[str, Variable], values: Values
+) -> tuple[Float[Tensor, "d m"], tuple[Float[Tensor, "d _ m"], ...]]:
     """Residuals and Jacobians (not whitened) by forward-mode autograd through every retraction."""
-    blocks = tuple(values[name][block] for name, block in term.slots)
     kinds = [variables[name] for name, _ in term.slots]
 
-    def moved(tangents, blocks, constants):
+    def moved(tangents, arguments):
         at = [
             kind.retract(block[None], xi[None])[0]
-            for kind, block, xi in zip(kinds, blocks, tangents, strict=True)
+            for kind, block, xi in zip(kinds, arguments, tangents, strict=False)
         ]
-        residual = term.residual(*at, *constants)
+        residual = term.residual(*at, *arguments[len(at) :])
         return residual, residual
 
-    zero = tuple(blocks[0].new_zeros(len(term), kind.tangent_dim) for kind in kinds)
-    jacobians, residual = vmap(jacfwd(moved, argnums=0, has_aux=True))(zero, blocks, term.constants)
+    arguments = _arguments(term, values)
+    zero = tuple(arguments[0].new_zeros(kind.tangent_dim, len(term)) for kind in kinds)
+    by_tangents = vmap(jacfwd(moved, has_aux=True), in_dims=-1, out_dims=-1)
+    jacobians, residual = by_tangents(zero, arguments)
     return residual, jacobians
+
+
+def _arguments(term: CostTerm, values: Values) -> tuple[Tensor, ...]:
+    """What the residual takes, the rows as the last axis: the blocks of every slot and the constants."""
+    blocks = (values[name].index_select(0, block) for name, block in term.slots)
+    return tuple(x.movedim(0, -1).contiguous() for x in (*blocks, *term.constants))
+
+
+def _scale(weight: Float[Tensor, " m"] | Float[Tensor, "m d"]) -> Float[Tensor, "#d m"]:
+    """Weights as factors of residuals, the rows as the last axis."""
+    return weight.mT.contiguous() if weight.ndim == 2 else weight[None]
 
 
 def term_costs(
@@ -186,9 +262,3 @@ def _losses(problem: Problem, piece: CostTerm, values: Values) -> Float[Tensor, 
     if group is None:
         return rho.sum()[None]
     return rho.new_zeros(problem.group_count).index_add_(0, group, rho)
-
-
-def _whiten(term: CostTerm, residual: Float[Tensor, "m d"]) -> Float[Tensor, "m d"]:
-    if term.weight is None:
-        return residual
-    return residual * (term.weight if term.weight.ndim == 2 else term.weight[:, None])

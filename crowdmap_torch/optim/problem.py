@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -33,11 +32,48 @@ class Variable:
 
 
 @dataclass(frozen=True)
+class SparseJacobian:
+    """A Jacobian of many rows of which all entries are zero but for some adjacent ones by each number of the residual."""
+
+    columns: int
+    rows: tuple[tuple[int, Float[Tensor, "_ m"]], ...]
+    """By number of the residual: the first column that is not zero, and the entries from there on."""
+
+    @classmethod
+    def diagonal(cls, entries: Float[Tensor, "k m"]) -> SparseJacobian:
+        """That of numbers which depend on one tangent each."""
+        return cls(len(entries), tuple((i, x[None]) for i, x in enumerate(entries)))
+
+    def dense(self) -> Float[Tensor, "d columns m"]:
+        """All entries."""
+        whole = self.rows[0][1].new_zeros(len(self.rows), self.columns, self.rows[0][1].shape[-1])
+        for row, (first, entries) in enumerate(self.rows):
+            whole[row, first : first + len(entries)] = entries
+        return whole
+
+
+@dataclass(frozen=True)
+class Follows:
+    """The Jacobian of a block whose moving is a multiple of the first slot's: of a point, minus the camera's."""
+
+    columns: int
+    """The first slot's Jacobian counts up to here."""
+    factor: float | Float[Tensor, " m"] = -1.0
+
+
+Jacobian = Tensor | SparseJacobian | Follows
+"""Derivatives of many rows by the tangents of one slot, [d, k, m]."""
+
+
+@dataclass(frozen=True)
 class CostTerm:
     """`1/2 sum_row rho(|weight * residual|^2)`."""
 
     residual: Callable[..., Tensor]
-    """Residual of ONE row: the value of one block per slot, then one row of each constant, to a vector [d]."""
+    """Residual of ONE row: the value of one block per slot, then one row of each constant, to a vector [d].
+
+    With a `jacobian` beside it, it is handed many rows at once as well, the rows their last axis; without, `vmap` maps it.
+    """
     slots: tuple[tuple[str, Int[Tensor, " m"]], ...]
     """Per slot the variable's name and the block that each row touches."""
     constants: tuple[Tensor, ...] = ()
@@ -45,14 +81,12 @@ class CostTerm:
     weight: Float[Tensor, " m"] | Float[Tensor, "m d"] | None = None
     """One over the standard deviation of each row, or of each of its residual's entries; None: one."""
     loss: Loss = field(default_factory=Quadratic)
-    jacobian: Callable[..., tuple[Tensor, tuple[Tensor, ...]]] | None = None
-    """Batched residuals [m, d] and one Jacobian [m, d, k] per slot, by the chain rule; None: by autograd."""
-    batched: Callable[..., Tensor] | None = None
-    """`residual` of many rows at once [m, d], where that is faster than mapping it over the rows."""
-    normal: Callable[..., Any] | None = None
-    """`linearize.RowBlocks` of many rows: `(blocks, constants, weight, loss)`; None: from the Jacobians."""
-    gradient: Callable[..., Any] | None = None
-    """`linearize.RowGradients` of many rows, likewise; None: what `normal` gives."""
+    jacobian: Callable[..., tuple[Tensor, tuple[Jacobian, ...]]] | None = None
+    """Residuals [d, m] and Jacobians [d, k, m] of many rows in closed form, at zero tangent; None: by autograd.
+
+    The arguments are those of `residual`, the rows their last axis. There is one Jacobian per slot, in their order; any
+    further ones, of arguments that this term holds constant, are not looked at.
+    """
 
     def __len__(self) -> int:
         return len(self.slots[0][1])

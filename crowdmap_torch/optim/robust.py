@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -33,7 +33,7 @@ class Loss(Protocol):
 class JointLoss(Loss, Protocol):
     """A loss of several adjacent rows together, so that rows are not free to be cut anywhere."""
 
-    def of_rows(self, index: slice | Tensor) -> Self:
+    def of_rows(self, index: slice | Tensor) -> JointLoss:
         """The loss of some of its rows; those that belong together are to stay together."""
         ...
 

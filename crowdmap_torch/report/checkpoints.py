@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,11 +25,6 @@ class Checkpoint:
     """The solver's own numbers: tensors, numbers, strings."""
 
 
-def config_hash(config_text: str) -> str:
-    """What tells configurations apart: 16 hexadecimal digits of the SHA-256 of their text."""
-    return hashlib.sha256(config_text.encode()).hexdigest()[:16]
-
-
 def save_checkpoint(
     path: Path,
     module: nn.Module,
@@ -47,7 +41,6 @@ def save_checkpoint(
         "module": module.state_dict(),
         "state": state or {},
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as beside:
         torch.save(content, beside)
 

@@ -26,7 +26,6 @@ from crowdmap_torch.report.tables_html import (
 
 def write_report(path: Path, record: RunRecord) -> None:
     """Write `record` as one self-contained HTML file, complete or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as beside:
         beside.write_text(report_html(record), encoding="utf-8")
 
@@ -58,7 +57,8 @@ def page_html(title: str, subtitle: str, sections: Sequence[tuple[str, str, str]
 def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
     """Anchor, title and content of each section; those without content are left out."""
     yield "headline", "At a glance", headline_cards(record)
-    yield "map", "Map", _map(record)
+    told = note("From above. A click on a row of the table of signs brings it here.")
+    yield "map", "Map", told + map_svg(record)
     yield "errors", "Errors", _errors(record)
     yield "journeys", "Journeys", _journeys(record)
     yield "clusters", "Clusters", _clusters(record)
@@ -68,12 +68,6 @@ def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
     yield "pruned", "Left out", _pruned(record)
     yield "timings", "Timings", timing_table(record.timings_s)
     yield "config", "Configuration", _config(record)
-
-
-def _map(record: RunRecord) -> str:
-    return note("From above. A click on a row of the table of signs brings it here.") + map_svg(
-        record
-    )
 
 
 def _errors(record: RunRecord) -> str:
@@ -95,7 +89,7 @@ def _errors(record: RunRecord) -> str:
 def _journeys(record: RunRecord) -> str:
     named = [
         *(("set aside", r) for r in record.rejected),
-        *(("suspect", r) for r in record.suspects),
+        *(("outlier", r) for r in record.outlier_journeys),
     ]
     warning = ""
     if named:
@@ -123,7 +117,7 @@ def _clusters(record: RunRecord) -> str:
     return note(
         "Eigenvalues of the graph Laplacian: as many are small as there are landmarks; "
         "the gap after them is where the number was read off."
-    ) + drawing(plots.plot_spectrum(record.spectra))
+    ) + drawing(plots.plot_eigengaps(record.spectra))
 
 
 def _residuals(record: RunRecord) -> str:

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.evaluation.polyline import sample_lanes
+from crowdmap_torch.evaluation.polyline import lane_samples
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.report.plots import BEFORE, FAINT, MAP, SURVEY, WRONG
 from crowdmap_torch.report.record import RunRecord
-from crowdmap_torch.tables import HdMap, Survey
+from crowdmap_torch.tables import Survey
 
 _LANE_STEP_M = 2.0
 _PATH_STEP_M = 5.0
@@ -64,14 +64,20 @@ def _layers(record: RunRecord) -> Iterator[tuple[str, str, str, str]]:
     if survey is not None:
         lines = _polylines(survey.lane_points.lane, survey.lane_points.point_world, 1.0)
         yield "survey-lanes", "survey lanes", SURVEY, _group(lines, SURVEY, 5, opacity=0.35)
-    yield "lanes", "map lanes", _LANES, _group(_lanes(hd_map), _LANES, 1.2)
+    samples = lane_samples(hd_map.lanes, _LANE_STEP_M)
+    lines = _polylines(samples.line, samples.point_world, 0.0)
+    yield "lanes", "map lanes", _LANES, _group(lines, _LANES, 1.2)
     if survey is not None:
         yield "survey-signs", "survey signs", SURVEY, _survey_signs(survey)
     if record.map_before is not None:
         before = _dots(record.map_before.signs.center_world, BEFORE, 4.5, ring_px=1.5)
         yield "before", "cluster heads", BEFORE, before
-    if record.comparison is not None and survey is not None:
-        errors = _error_lines(record)
+    comparison = record.comparison
+    if comparison is not None and survey is not None:
+        errors = _segments(
+            hd_map.signs.center_world[comparison.map_row, :2],
+            survey.signs.center_world[comparison.true_row, :2],
+        )
         yield "errors", "sign errors", WRONG, _group(errors, WRONG, 1.5)
     yield "signs", "map signs", MAP, _map_signs(record)
 
@@ -119,21 +125,6 @@ def _survey_signs(survey: Survey) -> str:
     row = torch.arange(len(corners), device=corners.device)
     ends = [corners[row, pick] for pick in (place.argmin(-1), place.argmax(-1))]
     return rings + _group(_segments(*ends), SURVEY, 3)
-
-
-def _error_lines(record: RunRecord) -> str:
-    comparison, survey = record.comparison, record.survey
-    if comparison is None or survey is None:
-        return ""
-    return _segments(
-        record.hd_map.signs.center_world[comparison.map_row, :2],
-        survey.signs.center_world[comparison.true_row, :2],
-    )
-
-
-def _lanes(hd_map: HdMap) -> str:
-    samples = sample_lanes(hd_map.lanes, _LANE_STEP_M)
-    return _polylines(samples.line, samples.point_world, 0.0)
 
 
 def _polylines(line: Int[Tensor, " p"], point_world: Float[Tensor, "p 3"], step_m: float) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -18,11 +19,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from crowdmap_torch.evaluation.polyline import sample_lanes
+from crowdmap_torch.evaluation.polyline import lane_samples
 from crowdmap_torch.evaluation.signs import SignComparison
-from crowdmap_torch.evaluation.statistics import mean_lengths
 from crowdmap_torch.io.atomic import atomic_file
-from crowdmap_torch.report.record import Iteration, JourneySummary, Spectrum
+from crowdmap_torch.report.iteration import Iteration
+from crowdmap_torch.report.summaries import JourneySummary
 from crowdmap_torch.tables import HdMap, Survey
 
 MAP, SURVEY, BEFORE, WRONG, FAINT, INK = (
@@ -76,17 +77,13 @@ def plot_map(hd_map: HdMap, survey: Survey | None = None, *, title: str = "") ->
         _draw_lines(axes, survey.lane_points.point_world, line, SURVEY, width=2.4, alpha=0.45)
         x, y = survey.signs.center_world[:, :2].cpu().unbind(-1)
         axes.plot(x, y, "o", mfc="none", mec=SURVEY, ms=7, label="survey")
-    samples = sample_lanes(hd_map.lanes, 2.0)
+    samples = lane_samples(hd_map.lanes, 2.0)
     _draw_lines(axes, samples.point_world, samples.line, MAP, width=0.9, alpha=1.0)
     center, normal = hd_map.signs.center_world.cpu(), hd_map.signs.normal_world.cpu()
     axes.plot(center[:, 0], center[:, 1], ".", color=MAP, ms=4, label="map")
     if len(center):
         axes.quiver(
-            *center[:, :2].unbind(-1),
-            *normal[:, :2].unbind(-1),
-            color=MAP,
-            width=0.0015,
-            scale=60,
+            *center[:, :2].unbind(-1), *normal[:, :2].unbind(-1), color=MAP, width=0.0015, scale=60
         )
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="east [m]", ylabel="north [m]", title=title)
@@ -120,16 +117,9 @@ def plot_sign_errors(
 
 
 def sign_errors(comparison: SignComparison, name: str) -> Float[Tensor, " k"]:
-    """The `absolute` or `relative` error of each matched observable sign [m].
-
-    The mean over its corners; of the centre where no corners were surveyed.
-    """
+    """The `absolute` or `relative` error of each matched observable sign [m]."""
     c = comparison
-    corner = c.corner_error_world if name == "absolute" else c.relative_corner_world
-    center = c.center_error_world if name == "absolute" else c.relative_center_world
-    at_corners, _, _ = mean_lengths(corner, c.corner_mask)
-    error = torch.where(c.corner_mask.any(-1), at_corners, center[:, 0].norm(dim=-1))
-    return error[c.counted & c.has_relative if name == "relative" else c.counted]
+    return c.error_m(name)[c.counted & c.has_relative if name == "relative" else c.counted]
 
 
 @styled
@@ -157,8 +147,19 @@ def plot_bias(journeys: Sequence[JourneySummary]) -> Figure:
     return figure
 
 
+@dataclass(frozen=True)
+class Eigengap:
+    """Eigenvalues of one graph Laplacian, and how many clusters its gap said."""
+
+    title: str
+    eigenvalue: tuple[float, ...]
+    """Ascending, the smallest ones."""
+    clusters: int
+    """The chosen gap is between this many eigenvalues and the next one."""
+
+
 @styled
-def plot_spectrum(spectra: Sequence[Spectrum]) -> Figure:
+def plot_eigengaps(spectra: Sequence[Eigengap]) -> Figure:
     """Eigenvalues of graph Laplacians, ascending, and the gap that was chosen."""
     figure, panels = new_figure(max(len(spectra), 1), width=9.0, height=2.9)
     for axes, spectrum in zip(panels, spectra, strict=False):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import TextIO
+from io import TextIOBase
 
 _PLAIN_EVERY_S = 10.0
 """Without a terminal a stage says no more often how far it is."""
@@ -13,7 +13,7 @@ _PLAIN_EVERY_S = 10.0
 class Progress:
     """Says which stage runs, how far it is, and when it will be done; keeps each stage's seconds."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
+    def __init__(self, stream: TextIOBase | None = None) -> None:
         self.seconds: dict[str, float] = {}
         self._stream = sys.stderr if stream is None else stream
         self._rewrites = self._stream.isatty()

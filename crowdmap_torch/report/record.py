@@ -1,79 +1,34 @@
-"""Everything that a report tells of one run, gathered by whoever ran it."""
+"""Everything that report.html tells of one run."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.evaluate import MapFigures
+from crowdmap_torch.config import MapperConfig, dump
+from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.signs import SignComparison
-from crowdmap_torch.tables import HdMap, RejectedJourney, Survey
+from crowdmap_torch.io.maps import certain_part
+from crowdmap_torch.io.truth import Truth
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.report.iteration import Iteration
+from crowdmap_torch.report.plots import Eigengap
+from crowdmap_torch.report.summaries import (
+    JourneySummary,
+    Pruned,
+    counts_of,
+    journey_summaries,
+    outlier_journeys_of,
+    pruned_of,
+)
+from crowdmap_torch.report.watch import Watch
+from crowdmap_torch.tables import Dataset, HdMap, RejectedJourney, Survey
 
-
-@dataclass(frozen=True)
-class Iteration:
-    """One step of the bundle adjustment."""
-
-    number: int
-    cost: Mapping[str, float]
-    """By term."""
-    damping: float
-    gain_ratio: float
-    step_norm: float
-    accepted: bool = True
-    errors: Mapping[str, float] = field(default_factory=dict)
-    """By TensorBoard tag (`evaluate.progress_scalars`)."""
-
-    @property
-    def total(self) -> float:
-        """Cost of all terms."""
-        return sum(self.cost.values())
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Eigenvalues of one graph Laplacian, and how many clusters its gap said."""
-
-    title: str
-    eigenvalue: tuple[float, ...]
-    """Ascending, the smallest ones."""
-    clusters: int
-    """The chosen gap is between this many eigenvalues and the next one."""
-
-
-@dataclass(frozen=True)
-class JourneySummary:
-    """What is told of one journey in use."""
-
-    journey_id: str
-    frames: int
-    detections: int
-    """Of signs."""
-    used: int
-    """Sign detections that are in a landmark of the map."""
-    signs: int
-    """Signs of its own triangulation."""
-    bias: tuple[float, float, float]
-    """East, north, up: adjusted minus given position, in the mean along the way [m]; NaN if it had no say."""
-    bias_sigma: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-    heading_deg: float = math.nan
-    """The same of the heading, counted from east to north."""
-    heading_sigma_deg: float = math.nan
-    true_bias: tuple[float, float, float] | None = None
-    """The same against the true poses (simulated data only)."""
-
-
-@dataclass(frozen=True)
-class Pruned:
-    """How many of what were left out where, and why."""
-
-    stage: str
-    reason: str
-    count: int
+_EIGENVALUES_SHOWN = 60
+"""Beyond a gap."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +52,9 @@ class RunRecord:
     pruned: tuple[Pruned, ...] = ()
     rejected: tuple[RejectedJourney, ...] = ()
     """Journeys set aside at the door."""
-    suspects: tuple[RejectedJourney, ...] = ()
+    outlier_journeys: tuple[RejectedJourney, ...] = ()
     """Journeys that lost their weight."""
-    spectra: tuple[Spectrum, ...] = ()
+    spectra: tuple[Eigengap, ...] = ()
     residual_px: Mapping[str, Float[Tensor, " n"]] = field(default_factory=dict)
     """Lengths of pixel residuals, by stage, in the order of the stages."""
     iterations: tuple[Iteration, ...] = ()
@@ -118,3 +73,50 @@ class RunRecord:
     def comparison_before(self) -> SignComparison | None:
         """Of the cluster heads."""
         return None if self.figures_before is None else self.figures_before.comparison
+
+
+def record_of(
+    dataset: Dataset,
+    result: MapResult,
+    config: MapperConfig,
+    watch: Watch,
+    seconds: Mapping[str, float],
+    survey: Survey | None,
+    truth: Truth | None,
+    figures: MapFigures | None,
+    figures_before: MapFigures | None,
+) -> RunRecord:
+    """What report.html is drawn from."""
+    hd_map, before = (
+        certain_part(m, config.min_confidence) for m in (result.hd_map, result.map_clusters)
+    )
+    return RunRecord(
+        title=f"Map of {len(dataset.journeys)} journeys",
+        hd_map=hd_map,
+        map_before=before,
+        survey=survey,
+        figures=figures,
+        figures_before=figures_before,
+        paths_world={
+            journey.journey_id: poses[:, :3, 3]
+            for journey, poses in zip(dataset.journeys, result.poses, strict=True)
+        },
+        journeys=journey_summaries(dataset, result, truth),
+        counts=counts_of(dataset, result, config),
+        pruned=pruned_of(dataset, result),
+        rejected=dataset.rejected,
+        outlier_journeys=outlier_journeys_of(dataset, result),
+        spectra=tuple(
+            Eigengap(
+                f"signs, d_c = {s.scale:g} m",
+                tuple(s.eigenvalues[: s.count + _EIGENVALUES_SHOWN].tolist()),
+                s.count,
+            )
+            for s in result.first.crowd.report.spectra
+        ),
+        residual_px=watch.residual_px,
+        iterations=tuple(watch.iterations),
+        outcome=result.state.reasons[0],
+        timings_s=dict(seconds),
+        config_yaml=dump(config),
+    )

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from html import escape
 
-from crowdmap_torch.evaluate import MapFigures
-from crowdmap_torch.evaluation.matching import DUPLICATE
-from crowdmap_torch.evaluation.statistics import ErrorFigures, mean_lengths
+from crowdmap_torch.evaluation.map_figures import MapFigures
+from crowdmap_torch.evaluation.statistics import ErrorFigures
+from crowdmap_torch.evaluation.text import number_text, percent_text
 from crowdmap_torch.geometry import polygon
-from crowdmap_torch.report.record import JourneySummary, Pruned, RunRecord
+from crowdmap_torch.report.record import RunRecord
+from crowdmap_torch.report.summaries import JourneySummary, Pruned
+from crowdmap_torch.survey.matching import DUPLICATE
 
 _MAX_SIGNS = 5000
 """Longer tables make browsers slow; the map's own file has all signs."""
@@ -38,10 +41,10 @@ def _cards(record: RunRecord) -> Iterator[tuple[str, str, str]]:
         yield "journeys", f"{len(record.journeys):,}", f"{frames:,} frames"
         if seen:
             detail = f"{used:,} of {seen:,}"
-            yield "sign detections used", _percent(used / seen), detail
-    bad = len(record.rejected) + len(record.suspects)
+            yield "sign detections used", percent_text(used / seen), detail
+    bad = len(record.rejected) + len(record.outlier_journeys)
     if bad:
-        detail = f"{len(record.rejected)} set aside, {len(record.suspects)} suspect"
+        detail = f"{len(record.rejected)} set aside, {len(record.outlier_journeys)} outliers"
         yield "journeys left out", str(bad), detail
     if record.timings_s:
         yield "time", f"{sum(record.timings_s.values()):.0f}<small>s</small>", "all stages"
@@ -64,17 +67,17 @@ def _figure_cards(figures: MapFigures) -> Iterator[tuple[str, str, str]]:
     )
     yield (
         "sign recall",
-        _percent(signs.recall),
+        percent_text(signs.recall),
         f"{signs.matched_observable} of {signs.observable} observable",
     )
     yield (
         "sign precision",
-        _percent(signs.precision),
+        percent_text(signs.precision),
         f"{signs.duplicates} duplicates, {signs.false} false",
     )
     if figures.lanes is not None:
         lanes = figures.lanes
-        yield "lane recall", _percent(lanes.recall), f"{lanes.seen_length_m:,.0f} m seen"
+        yield "lane recall", percent_text(lanes.recall), f"{lanes.seen_length_m:,.0f} m seen"
         lateral = _metres(lanes.lateral_without_shift.mean)
         yield (
             "lane lateral error",
@@ -82,40 +85,50 @@ def _figure_cards(figures: MapFigures) -> Iterator[tuple[str, str, str]]:
             f"{lateral} without the signs' shift",
         )
     if figures.association is not None:
-        detail = f"pairs: precision {_percent(figures.association.pair_precision)}"
-        yield "data loss", _percent(figures.association.data_loss), detail
+        detail = f"pairs: precision {percent_text(figures.association.pair_precision)}"
+        yield "data loss", percent_text(figures.association.data_loss), detail
 
 
 def error_table(figures: MapFigures, before: MapFigures | None) -> str:
     """Mean, median and 95th percentile of every error; beside it the mean of the cluster heads."""
-    rows: list[tuple[str, ErrorFigures, ErrorFigures | None]] = []
-    older = before.signs if before is not None else None
-    for name in ("absolute", "relative", "absolute_center", "relative_center"):
-        for part in ("total", "horizontal", "vertical"):
-            title = name.replace("_", " ").replace("center", "centre")
-            title = title if "centre" in title else f"{title} corner"
-            title = title if part == "total" else f"{title}, {part}"
-            then = getattr(getattr(older, name), part) if older is not None else None
-            rows.append((title, getattr(getattr(figures.signs, name), part), then))
-    if figures.oracle is not None:
-        rows.insert(3, ("oracle corner", figures.oracle.total, None))
-    for name, title in (("width", "width"), ("height", "height"), ("normal_deg", "normal [deg]")):
-        then = getattr(older, name) if older is not None else None
-        rows.append((title, getattr(figures.signs, name), then))
-    if figures.lanes is not None:
-        for name in ("lateral", "vertical", "lateral_without_shift", "width"):
-            then = before.lanes if before is not None else None
-            title = "lane " + name.replace("_", " ")
-            old = getattr(then, name) if then is not None else None
-            rows.append((title, getattr(figures.lanes, name), old))
+    # Adjustment leaves the oracle as it is.
+    then = {} if before is None else dict(_errors(replace(before, oracle=None)))
     head = ["", "mean", "median", "95 %", "count"]
     head += ["mean of cluster heads"] if before is not None else []
-    cells = []
-    for title, errors, old in rows:
-        numbers = [_number(v) for v in (errors.mean, errors.median, errors.p95)]
-        last = [_number(old.mean) if old is not None else ""] if before is not None else []
-        cells.append((title, *numbers, str(errors.count), *last))
-    return simple_table(head, [c for c in cells if c[4] != "0"])
+    rows = []
+    for title, errors in _errors(figures):
+        if errors.count:
+            numbers = [number_text(v) for v in (errors.mean, errors.median, errors.p95)]
+            row = [title, *numbers, str(errors.count)]
+            if before is not None:
+                row.append(number_text(then[title].mean) if title in then else "")
+            rows.append(row)
+    return simple_table(head, rows)
+
+
+def _errors(figures: MapFigures) -> Iterator[tuple[str, ErrorFigures]]:
+    """Title and figures of every error that is known, in the order of the table."""
+    signs, lanes = figures.signs, figures.lanes
+    for title, positions in (
+        ("absolute corner", signs.absolute),
+        ("oracle corner", figures.oracle),
+        ("relative corner", signs.relative),
+        ("absolute centre", signs.absolute_center),
+        ("relative centre", signs.relative_center),
+    ):
+        if positions is not None:
+            yield title, positions.total
+            if positions is not figures.oracle:
+                yield f"{title}, horizontal", positions.horizontal
+                yield f"{title}, vertical", positions.vertical
+    yield from (
+        ("width", signs.width),
+        ("height", signs.height),
+        ("normal [deg]", signs.normal_deg),
+    )
+    if lanes is not None:
+        for name in ("lateral", "vertical", "lateral_without_shift", "width"):
+            yield "lane " + name.replace("_", " "), getattr(lanes, name)
 
 
 def bias_table(journeys: Sequence[JourneySummary]) -> str:
@@ -136,7 +149,7 @@ def bias_table(journeys: Sequence[JourneySummary]) -> str:
         share = j.used / j.detections if j.detections else math.nan
         cells = [_cell(j.journey_id, j.journey_id), _cell(str(j.frames), j.frames)]
         cells += [_cell(f"{n:,}", n) for n in (j.signs, j.detections)]
-        cells.append(_cell(_percent(share), share))
+        cells.append(_cell(percent_text(share), share))
         cells += [_uncertain_cell(b, s) for b, s in zip(j.bias, j.bias_sigma, strict=True)]
         cells.append(_uncertain_cell(j.heading_deg, j.heading_sigma_deg))
         rows.append(f"<tr>{''.join(cells)}</tr>")
@@ -171,7 +184,7 @@ def sign_table(record: RunRecord) -> str:
         if record.comparison is not None:
             tag = f'<span class="tag {status[k]}">{status[k]}</span>'
             cells.append(f'<td class="text" data-v="{status[k]}">{tag}</td>')
-            cells += [_cell(_number(e), e) for e in (absolute[k], relative[k])]
+            cells += [_cell(number_text(e), e) for e in (absolute[k], relative[k])]
         place = f'data-x="{center[k][0]:.2f}" data-y="{center[k][1]:.2f}"'
         rows.append(f'<tr class="pick" {place}>{"".join(cells)}</tr>')
     note = ""
@@ -191,17 +204,11 @@ def _against_survey(record: RunRecord) -> tuple[list[str], list[float], list[flo
             status[row] = "duplicate"
         elif kind >= 0:
             status[row] = "control" if bool(c.control[kind]) else "matched"
-    errors = []
-    for corner, center in (
-        (c.corner_error_world, c.center_error_world),
-        (c.relative_corner_world, c.relative_center_world),
+    relative_m = c.error_m("relative").where(c.has_relative, math.nan).tolist()
+    for row, *errors in zip(
+        c.map_row.tolist(), c.error_m("absolute").tolist(), relative_m, strict=True
     ):
-        at_corners, _, _ = mean_lengths(corner, c.corner_mask)
-        errors.append(at_corners.where(c.corner_mask.any(-1), center[:, 0].norm(dim=-1)).tolist())
-    has_relative = c.has_relative.tolist()
-    for k, row in enumerate(c.map_row.tolist()):
-        absolute[row] = errors[0][k]
-        relative[row] = errors[1][k] if has_relative[k] else math.nan
+        absolute[row], relative[row] = errors
     return status, absolute, relative
 
 
@@ -269,17 +276,9 @@ def _is_word(text: str) -> bool:
     return any(c.isalpha() for c in text)
 
 
-def _number(value: float) -> str:
-    return f"{value:.3f}" if math.isfinite(value) else "-"
-
-
 def _metres(value: float) -> str:
     return f"{value:.3f} m" if math.isfinite(value) else "unknown"
 
 
 def _metres_html(value: float) -> str:
     return f"{value:.3f}<small>m</small>" if math.isfinite(value) else "-"
-
-
-def _percent(value: float) -> str:
-    return f"{100 * value:.1f} %" if math.isfinite(value) else "-"

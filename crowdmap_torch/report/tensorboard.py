@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from torch.utils.tensorboard.writer import SummaryWriter
 
-from crowdmap_torch.evaluate import MapFigures
 from crowdmap_torch.report import plots
-from crowdmap_torch.report.record import Iteration
+from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.tables import HdMap, Survey
 
 _MAX_SAMPLES = 200_000
@@ -82,23 +81,6 @@ class TensorBoardLog:
             return
         flat = flat[:: max(len(flat) // _MAX_SAMPLES, 1)]
         self._writer.add_histogram(tag, flat.to(torch.float64).cpu().numpy(), step)
-
-    def log_figures(self, figures: MapFigures, step: int, *, prefix: str = "survey") -> None:
-        """The headline figures against the survey."""
-        signs = figures.signs
-        scalars = {
-            "absolute_corner_m": signs.absolute.total.mean,
-            "relative_corner_m": signs.relative.total.mean,
-            "absolute_center_m": signs.absolute_center.total.mean,
-            "absolute_over_oracle": figures.absolute_over_oracle,
-            "sign_recall": signs.recall,
-            "sign_precision": signs.precision,
-        }
-        if figures.lanes is not None:
-            scalars["lane_recall"] = figures.lanes.recall
-            scalars["lane_precision"] = figures.lanes.precision
-            scalars["lane_lateral_m"] = figures.lanes.lateral.mean
-        self.log_scalars({f"{prefix}/{name}": value for name, value in scalars.items()}, step)
 
     def log_map(self, tag: str, hd_map: HdMap, survey: Survey | None, step: int) -> None:
         """The map from above, with the survey under it."""

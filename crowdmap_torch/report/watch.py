@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.bundle import Bundle
-from crowdmap_torch.evaluate import progress_scalars
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.evaluation.evaluate import progress_scalars
 from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.optim.linearize import residuals
-from crowdmap_torch.report.record import Iteration
+from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.tensorboard import TensorBoardLog
-from crowdmap_torch.stages import adjust
 from crowdmap_torch.tables import HdMap, Lanes, Signs, Survey
 
 _LANES_EVERY = 5

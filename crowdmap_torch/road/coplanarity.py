@@ -11,11 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry.plane import harmonic_mean_singular_value, smallest_singular_value
-from crowdmap_torch.road.level import Level
+from crowdmap_torch.road.ego_motion import EgoMotion
+from crowdmap_torch.tables import Rows
 
 NO_STEP = 1e-7
 """Newton steps below this end the search [rad]."""
@@ -56,21 +57,13 @@ class CoplanarityConfig:
 
 
 @dataclass(frozen=True)
-class PoseNodes:
+class PoseNodes(Rows):
     """Poses picked at equal distances along the way, at most one for each cell of it."""
 
     cell: Int[Tensor, " n"]
     """Increasing; `poses` cells make up a segment."""
     R_world_road: Float[Tensor, "n 3 3"]
     position: Float[Tensor, "n 3"]
-
-    @property
-    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All of them."""
-        return self.cell, self.R_world_road, self.position
-
-    def __getitem__(self, index: Tensor) -> PoseNodes:
-        return PoseNodes(*(column[index] for column in self.columns))
 
 
 @dataclass(frozen=True)
@@ -87,7 +80,7 @@ class NormalUpdates:
 
 
 def pick_nodes(
-    level: Level, station: Float[Tensor, " stations"], config: CoplanarityConfig
+    motion: EgoMotion, station: Float[Tensor, " stations"], config: CoplanarityConfig
 ) -> PoseNodes:
     """The first pose in each cell that frames newly enter.
 
@@ -95,7 +88,7 @@ def pick_nodes(
     """
     cell = (station * (config.poses / config.segment_m)).floor().long()
     enters = cell[1:] > cell[:-1]
-    return PoseNodes(cell[1:][enters], level.R_world_road[enters], level.position[enters])
+    return PoseNodes(cell[1:][enters], motion.R_world_road[enters], motion.position[enters])
 
 
 def coplanar_normals(
@@ -122,34 +115,8 @@ def coplanar_normals(
     if not len(frame):
         none = nodes.position[:0, 0]
         return NormalUpdates(frame, none, none, none)
-    R = nodes.R_world_road[index]
-    c = nodes.position[index]
-    weight = present.to(c)
-    number = weight.sum(-1)[..., None, None].clamp_min(1)
-    c = c - (weight[..., None] * c).sum(-2, keepdim=True) / number
-    rays = torch.cartesian_prod(c.new_tensor(config.points_right), c.new_tensor(config.points_down))
-    rays = torch.cat((rays, torch.ones_like(rays[:, :1])), dim=-1)
-    singular = COSTS[config.cost]
-
-    def costs(tilt: Float[Tensor, "u 2"]) -> Float[Tensor, " u"]:
-        n = torch.nn.functional.normalize(
-            torch.stack((tilt[:, 1], torch.ones_like(tilt[:, 0]), tilt[:, 0]), dim=-1), dim=-1
-        )
-        v = rays * (height / (n @ rays.T))[..., None]
-        mean, square = v.mean(1), (v[..., :, None] * v[..., None, :]).mean(1)
-        seen = c + (R @ mean[:, None, None, :, None])[..., 0]
-        spread = R @ (square - mean[:, :, None] * mean[:, None, :])[:, None, None] @ R.mT
-        centre = (weight[..., None] * seen).sum(-2, keepdim=True) / number
-        off = seen - centre
-        between = off[..., :, None] * off[..., None, :]
-        S = (weight[..., None, None] * (between + spread)).sum(-3) * len(rays)
-        # Where there is no segment, three distinct values: those of a zero matrix have no
-        # derivative.
-        there = present.any(-1)
-        S = torch.where(there[..., None, None], S, torch.diag(S.new_tensor([1.0, 2.0, 3.0])))
-        return torch.where(there, singular(S), 0.0).sum(-1)
-
-    tilt, cost, H = _minimise(costs, start.expand(len(frame), 2), config.iterations)
+    segments = _Segments(nodes.R_world_road[index], nodes.position[index], present, height, config)
+    tilt, cost, H = _minimise(segments.costs, start.expand(len(frame), 2), config.iterations)
     # The points of one pose are all wrong together: poses count, not points.
     freedom = (present.sum((-1, -2)) - 4 * complete[enough].sum(-1)).clamp_min(1)
     eigenvalue, V = torch.linalg.eigh(H)
@@ -159,6 +126,45 @@ def coplanar_normals(
     sigma = variance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     sigma = torch.where(eigenvalue[:, 0] > 0, sigma, torch.inf)
     return NormalUpdates(frame, tilt[:, 0], tilt[:, 1], sigma)
+
+
+class _Segments:
+    """The scatter of a road's fixed points over the segments before each update (eq:rne)."""
+
+    def __init__(
+        self,
+        R_world_road: Float[Tensor, "u g p 3 3"],
+        position: Float[Tensor, "u g p 3"],
+        present: Bool[Tensor, "u g p"],
+        height: float,
+        config: CoplanarityConfig,
+    ) -> None:
+        self.R, self.height, self.singular = R_world_road, height, COSTS[config.cost]
+        self.there = present.any(-1)
+        self.weight = present.to(position)
+        self.number = self.weight.sum(-1)[..., None, None].clamp_min(1)
+        centre = (self.weight[..., None] * position).sum(-2, keepdim=True) / self.number
+        self.c = position - centre
+        right, down = (position.new_tensor(v) for v in (config.points_right, config.points_down))
+        rays = torch.cartesian_prod(right, down)
+        self.rays = torch.cat((rays, torch.ones_like(rays[:, :1])), dim=-1)
+
+    def costs(self, tilt: Float[Tensor, "u 2"]) -> Float[Tensor, " u"]:
+        """The sum over segments of how far points are from a plane, for the normals of pitch and roll `tilt`."""
+        n = torch.nn.functional.normalize(
+            torch.stack((tilt[:, 1], torch.ones_like(tilt[:, 0]), tilt[:, 0]), dim=-1), dim=-1
+        )
+        v = self.rays * (self.height / (n @ self.rays.T))[..., None]
+        mean, square = v.mean(1), (v[..., :, None] * v[..., None, :]).mean(1)
+        seen = self.c + (self.R @ mean[:, None, None, :, None])[..., 0]
+        spread = self.R @ (square - mean[:, :, None] * mean[:, None, :])[:, None, None] @ self.R.mT
+        centre = (self.weight[..., None] * seen).sum(-2, keepdim=True) / self.number
+        off = seen - centre
+        between = off[..., :, None] * off[..., None, :]
+        S = (self.weight[..., None, None] * (between + spread)).sum(-3) * len(self.rays)
+        # Where there is no segment, three distinct values: those of a zero matrix have no derivative.
+        S = torch.where(self.there[..., None, None], S, torch.diag(S.new_tensor([1.0, 2.0, 3.0])))
+        return torch.where(self.there, self.singular(S), 0.0).sum(-1)
 
 
 def _rows(

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.road.level import Level
-from crowdmap_torch.road.reckoning import fit_slip, headings, reckon
-from crowdmap_torch.road.vanishing import LaneRays
+from crowdmap_torch.road.dead_reckoning import dead_reckon, fit_slip, headings
+from crowdmap_torch.road.ego_motion import EgoMotion
+from crowdmap_torch.road.vanishing_point import LaneRays
 
 _NODE_M = 0.5
 """Nodes of the surface are this far apart or further."""
@@ -68,31 +68,31 @@ class SurfacePoints:
 
 
 def lay_surface(
-    level: Level,
+    motion: EgoMotion,
     alpha: Float[Tensor, " f"],
     beta: Float[Tensor, " f"],
     height: Float[Tensor, " f"],
 ) -> DriveSurface:
     """The surface of a drive whose camera has these heights above it, its normal these tilts."""
-    slope, cross = alpha - level.alpha, beta - level.beta
-    slip = fit_slip(level, slope)
-    across, up = reckon(level, slope, slip)
+    slope, cross = alpha - motion.alpha, beta - motion.beta
+    slip = fit_slip(motion, slope)
+    across, up = dead_reckon(motion, slope, slip)
     normal = torch.stack((beta, torch.ones_like(alpha), alpha), dim=-1)
     normal = torch.nn.functional.normalize(normal, dim=-1)
-    down = height[:, None] * (level.R_world_road @ normal[..., None])[..., 0]
+    down = height[:, None] * (motion.R_world_road @ normal[..., None])[..., 0]
     foot = torch.cat((across + down[:, :2], up[:, None]), dim=-1)
     centre = foot - down
-    station = level.station.cummax(0)[0]
+    station = motion.station.cummax(0)[0]
     return DriveSurface(
         station=station,
         slope=slope,
         centre=centre,
-        shift=level.position - centre,
-        node=_nodes(station, foot, headings(level) + slip.angle, cross, slope),
+        shift=motion.position - centre,
+        node=_nodes(station, foot, headings(motion) + slip.angle, cross, slope),
     )
 
 
-def meet(
+def intersect(
     surface: DriveSurface,
     ray_world: Float[Tensor, "p 3"],
     frame: Int[Tensor, " p"],
@@ -108,8 +108,8 @@ def meet(
     start = surface.station[frame]
     for _ in range(_STEPS):
         point = origin + depth[:, None] * ray_world
-        place, course, cross = surface.at(station)
-        ahead = torch.stack((course.cos(), course.sin()), dim=-1)
+        place, heading, cross = surface.at(station)
+        ahead = torch.stack((heading.cos(), heading.sin()), dim=-1)
         gap = point[:, :2] - place[:, :2]
         along = (gap * ahead).sum(-1)
         offset = gap[:, 0] * ahead[:, 1] - gap[:, 1] * ahead[:, 0]
@@ -121,10 +121,10 @@ def meet(
         depth = (depth + step.clamp(-0.3 * depth, 0.3 * depth)).clamp_min(1e-3)
         station = station + along.clamp(-10, 10)
     point = origin + depth[:, None] * ray_world
-    place, course, cross = surface.at(station)
+    place, heading, cross = surface.at(station)
     gap = point[:, :2] - place[:, :2]
-    along = gap[:, 0] * course.cos() + gap[:, 1] * course.sin()
-    offset = gap[:, 0] * course.sin() - gap[:, 1] * course.cos()
+    along = gap[:, 0] * heading.cos() + gap[:, 1] * heading.sin()
+    offset = gap[:, 0] * heading.sin() - gap[:, 1] * heading.cos()
     above = point[:, 2] - place[:, 2] - cross * offset
     is_met = (above.abs() < 0.02) & (along.abs() < 0.5) & (station > start)
     return SurfacePoints(station, offset, point, depth, is_met)
@@ -132,7 +132,7 @@ def meet(
 
 def flattened_rays(
     surface: DriveSurface,
-    level: Level,
+    motion: EgoMotion,
     rays: LaneRays,
     alpha: Float[Tensor, " f"],
     beta: Float[Tensor, " f"],
@@ -145,9 +145,9 @@ def flattened_rays(
     frame = rays.frame[rays.detection]
     ray = torch.stack((rays.x, rays.y, torch.ones_like(rays.x)), dim=-1)
     depression = rays.y + alpha[frame] + beta[frame] * rays.x
-    points = meet(
+    points = intersect(
         surface,
-        (level.R_world_road[frame] @ ray[..., None])[..., 0],
+        (motion.R_world_road[frame] @ ray[..., None])[..., 0],
         frame,
         height[frame] / depression.clamp_min(0.02),
     )
@@ -160,15 +160,15 @@ def flattened_rays(
 
 
 def _nodes(
-    station: Tensor, foot: Tensor, course: Tensor, cross: Tensor, slope: Tensor
+    station: Tensor, foot: Tensor, heading: Tensor, cross: Tensor, slope: Tensor
 ) -> Float[Tensor, "n 6"]:
     """Rows of the frames that are `_NODE_M` apart, and one far ahead and behind each."""
     index = (station / _NODE_M).floor()
     first = torch.cat((torch.ones_like(index[:1], dtype=torch.bool), index[1:] > index[:-1]))
-    row = torch.cat((station[:, None], foot, course[:, None], cross[:, None]), dim=-1)[first]
+    row = torch.cat((station[:, None], foot, heading[:, None], cross[:, None]), dim=-1)[first]
     ends = []
     for k, way in ((0, -_BEYOND_M), (-1, _BEYOND_M)):
-        c, s = course[first][k], slope[first][k]
+        c, s = heading[first][k], slope[first][k]
         beyond = torch.stack((c.cos(), c.sin(), s)) * way / (1 + s.square()).sqrt()
         end = row[k].clone()
         end[0] += way

@@ -24,7 +24,7 @@ from crowdmap_torch.simulate.rigs import RigConfig, SimulatedRig, build_rig
 from crowdmap_torch.simulate.sign_detections import SignDetectionConfig, SignRows
 from crowdmap_torch.simulate.sign_perception import detect_signs
 from crowdmap_torch.simulate.vehicle import Drive, VehicleConfig, drive_through
-from crowdmap_torch.simulate.worlds import PRESETS, World, WorldConfig, build_world
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, World, WorldConfig, build_world
 
 _WORLD, _RIG, _JOURNEY, _FAULTS = range(4)
 """Streams of random numbers: what one of them draws does not depend on how much the others did."""
@@ -39,7 +39,7 @@ DETECTION_PRESETS = {
 class SimulationConfig:
     """Everything that decides a dataset; the same configuration gives the same bytes."""
 
-    world: WorldConfig = field(default_factory=lambda: PRESETS["suburb"])
+    world: WorldConfig = field(default_factory=lambda: WORLD_PRESETS["suburb"])
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     rig: RigConfig = field(default_factory=RigConfig)
     positioning: PositioningConfig = field(default_factory=PositioningConfig)
@@ -178,7 +178,7 @@ def _write_journey(
             "started_at": journey.started.strftime("%Y-%m-%dT%H:%M:%SZ"),
         },
     )
-    files.write_poses(
+    files.write_drive_poses(
         folder / "poses.parquet",
         journey.drive,
         journey.T_reported,

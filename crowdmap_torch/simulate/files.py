@@ -37,7 +37,7 @@ def write_rig(folder: Path, rig: SimulatedRig) -> None:
         (folder / "rig.urdf").write_text(rig.urdf, encoding="utf-8")
 
 
-def write_poses(
+def write_drive_poses(
     path: Path,
     drive: Drive,
     T_world_link: Float[np.ndarray, "f 4 4"],
@@ -66,7 +66,7 @@ def write_sign_rows(path: Path, rows: SignRows, drive: Drive) -> None:
     """`signs.parquet` of a journey."""
     count = _CORNERS[rows.shape]
     slots = np.arange(8)[None] < count[:, None]
-    _write(
+    write_parquet(
         path,
         {
             "frame": drive.frame[rows.frame],
@@ -74,7 +74,7 @@ def write_sign_rows(path: Path, rows: SignRows, drive: Drive) -> None:
             "u": list_column(rows.corners_px[..., 0][slots], count, pa.float32()),
             "v": list_column(rows.corners_px[..., 1][slots], count, pa.float32()),
             "type": name_column(rows.code, all_codes()),
-            "score": pa.array(rows.score.astype(np.float32)),
+            "score": rows.score.astype(np.float32),
             "track": pa.array(rows.track, mask=rows.track < 0),
         },
     )
@@ -82,14 +82,14 @@ def write_sign_rows(path: Path, rows: SignRows, drive: Drive) -> None:
 
 def write_lane_rows(path: Path, rows: LaneRows, drive: Drive) -> None:
     """`lanes.parquet` of a journey."""
-    _write(
+    write_parquet(
         path,
         {
             "frame": drive.frame[rows.frame],
             "u": list_column(rows.px[:, 0], rows.count, pa.float32()),
             "v": list_column(rows.px[:, 1], rows.count, pa.float32()),
             "type": name_column(rows.type, TYPES),
-            "score": pa.array(rows.score.astype(np.float32)),
+            "score": rows.score.astype(np.float32),
         },
     )
 
@@ -105,8 +105,8 @@ def write_truth(
 ) -> None:
     """What scorers may know of a journey: true poses, what each row shows, the road below."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_poses(folder / "poses.parquet", drive, T_world_link, started_ns)
-    _write(
+    write_drive_poses(folder / "poses.parquet", drive, T_world_link, started_ns)
+    write_parquet(
         folder / "signs.parquet",
         {
             "row": np.arange(len(signs)),
@@ -114,7 +114,7 @@ def write_truth(
             "outlier": signs.is_outlier,
         },
     )
-    _write(
+    write_parquet(
         folder / "lanes.parquet",
         {
             "row": np.arange(len(lanes)),
@@ -123,7 +123,7 @@ def write_truth(
         },
     )
     normal = drive.road_normal_camera
-    _write(
+    write_parquet(
         folder / "road.parquet",
         {
             "frame": drive.frame,
@@ -148,7 +148,7 @@ def write_survey(folder: Path, world: World, provenance: dict) -> None:
     signs = world.signs
     count = _CORNERS[signs.shape]
     corners = signs.corners()[np.arange(8)[None] < count[:, None]]
-    _write(
+    write_parquet(
         folder / "signs.parquet",
         {
             "sign_id": pa.array(signs.sign_id, pa.string()),
@@ -171,7 +171,7 @@ def write_survey(folder: Path, world: World, provenance: dict) -> None:
         keep[-1] = True
         thinned = thinned[keep]
         points.append(thinned[::-1] if markers.is_oncoming[marker] else thinned)
-    _write(
+    write_parquet(
         folder / "lanes.parquet",
         {
             "lane_id": pa.array(markers.lane_id, pa.string()),
@@ -182,11 +182,4 @@ def write_survey(folder: Path, world: World, provenance: dict) -> None:
             ),
             "sigma_m": np.full(len(markers), 1e-3),
         },
-    )
-
-
-def _write(path: Path, columns: dict[str, pa.Array | np.ndarray]) -> None:
-    write_parquet(
-        path,
-        {k: pa.array(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()},
     )

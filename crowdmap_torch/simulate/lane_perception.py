@@ -243,10 +243,7 @@ def _points(
 
 
 def _seen(
-    point: Float[np.ndarray, "d k 3"],
-    drive: Drive,
-    camera: Camera,
-    frame: Int[np.ndarray, " d"],
+    point: Float[np.ndarray, "d k 3"], drive: Drive, camera: Camera, frame: Int[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, "d k 2"], Bool[np.ndarray, "d k"]]:
     """Pixels of the points; not visible are those outside the image and those behind a crest."""
     p_camera = _in_camera(point, drive, frame)

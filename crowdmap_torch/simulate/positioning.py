@@ -45,7 +45,7 @@ class PositioningConfig:
     """False: the sigma columns are left out."""
 
 
-PRESETS: dict[str, PositioningConfig] = {
+POSITIONING_PRESETS: dict[str, PositioningConfig] = {
     "paper": PositioningConfig(),
     "consumer": replace(PositioningConfig(), bias_e_m=0.85, bias_n_m=0.85, bias_u_m=1.2),
 }
@@ -89,9 +89,7 @@ def measured_poses(
     return se3.retract(torch.from_numpy(T_world_link), xi).numpy()
 
 
-def reported_sigmas(
-    config: PositioningConfig,
-) -> tuple[Float[np.ndarray, " 3"], float] | None:
+def reported_sigmas(config: PositioningConfig) -> tuple[Float[np.ndarray, " 3"], float] | None:
     """The module's own 1-sigma of position (e, n, u) and rotation [rad]; None if it is silent."""
     if not config.sigmas:
         return None

@@ -67,12 +67,7 @@ def build_rig(config: RigConfig, index: int, rng: np.random.Generator) -> Simula
     joints = (
         ("base_link", "roof_mount", (forward, left, height - 0.1), (0.0, 0.0, 0.0)),
         ("roof_mount", "camera_housing", (0.0, 0.0, 0.1), rpy),
-        (
-            "camera_housing",
-            "camera_optical",
-            (0.0, 0.0, 0.0),
-            (-np.pi / 2, 0.0, -np.pi / 2),
-        ),
+        ("camera_housing", "camera_optical", (0.0, 0.0, 0.0), (-np.pi / 2, 0.0, -np.pi / 2)),
         ("base_link", "imu_link", (0.3, -0.2, 0.5), (0.0, 0.0, np.pi)),
     )
     T_base_camera = np.eye(4)

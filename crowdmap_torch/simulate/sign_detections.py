@@ -107,7 +107,7 @@ def corner_sigma(
     return config.pixel_noise_px * np.sqrt(1 + (config.small_box_px / box_px) ** 2)
 
 
-def concatenate(tables: tuple[SignRows, ...]) -> SignRows:
+def concatenate_rows(tables: tuple[SignRows, ...]) -> SignRows:
     """One table with the rows of all, in order."""
     columns = (np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(SignRows))
     return SignRows(*columns)

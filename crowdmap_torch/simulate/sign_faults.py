@@ -62,8 +62,7 @@ def ghosts(
     count = single + runs + carried
     kind = np.repeat([0, 1, 2], [single, runs, carried])
     lasts = np.choose(
-        kind,
-        (np.ones(count, np.int64), rng.integers(3, 9, count), rng.integers(15, 61, count)),
+        kind, (np.ones(count, np.int64), rng.integers(3, 9, count), rng.integers(15, 61, count))
     )
     begins = rng.integers(0, max(frames, 1), count)
     shape = rng.integers(0, len(polygon.SHAPES), count)

@@ -14,7 +14,7 @@ from crowdmap_torch.simulate.sign_detections import (
     SignDetectionConfig,
     SignRows,
     all_codes,
-    concatenate,
+    concatenate_rows,
     corner_sigma,
 )
 from crowdmap_torch.simulate.sign_faults import ghosts, with_outliers, with_wrong_shapes
@@ -70,7 +70,7 @@ def detect_signs(
         sign=sign,
         is_outlier=is_wrong | is_far_off,
     )
-    rows = concatenate(
+    rows = concatenate_rows(
         (true_rows, ghosts(len(drive), camera, config, rng, int(track.max(initial=0))))
     )
     rows = rows[_inside(rows, camera)]

@@ -19,6 +19,15 @@ CODES: dict[str, tuple[str, ...]] = {
     "pentagon": ("US:S1-1",),
     "octagon": ("US:R1-1",),
 }
+SHARES = {
+    "rectangle": 0.42,
+    "diamond": 0.22,
+    "octagon": 0.1,
+    "triangle": 0.09,
+    "inverted_triangle": 0.09,
+    "pentagon": 0.08,
+}
+"""How common shapes are, before they are scaled to 1."""
 PANEL_CODES = ("US:E1-5", "US:E5-1", "US:E6-2")
 """Of the large panels of a gantry."""
 
@@ -209,15 +218,8 @@ def put_up_signs(
 
 def _pick(rng: np.random.Generator, *, shared: bool) -> tuple[str, str, tuple[float, float]]:
     """Shape, code and size of a sign; those on shared posts are small enough not to touch."""
-    shares = {
-        "rectangle": 0.42,
-        "diamond": 0.22,
-        "octagon": 0.1,
-        "triangle": 0.09,
-        "inverted_triangle": 0.09,
-        "pentagon": 0.08,
-    }
-    shape = str(rng.choice(list(shares), p=list(shares.values())))
+    share = np.array([*SHARES.values()])
+    shape = str(rng.choice([*SHARES], p=share / share.sum()))
     code = str(rng.choice(CODES[shape]))
     scale = rng.uniform(0.55, 0.66) if shared else rng.uniform(0.6, 0.9)
     if shape == "rectangle":

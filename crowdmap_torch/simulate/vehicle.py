@@ -125,10 +125,7 @@ def drive_through(
 
 
 def _speed_profile(
-    world: World,
-    config: VehicleConfig,
-    station: Float[np.ndarray, " n"],
-    rng: np.random.Generator,
+    world: World, config: VehicleConfig, station: Float[np.ndarray, " n"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Speed at each node, and how long the car waits there."""
     cruise = world.config.speed_mps * rng.uniform(0.95, 1.05)

@@ -52,7 +52,7 @@ class WorldConfig:
             raise ValueError("no lane to drive in: expected at least one in each driven direction")
 
 
-PRESETS: dict[str, WorldConfig] = {
+WORLD_PRESETS: dict[str, WorldConfig] = {
     "street": WorldConfig(
         name="street",
         length_m=250.0,

@@ -8,13 +8,11 @@ from dataclasses import replace
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import plot_bars
+from crowdmap_torch.studies.fleet import OURS, in_short_turns, short_maps
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import numbers, results, spread
-from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
+from crowdmap_torch.studies.numbers import results, spreads
 from crowdmap_torch.studies.study import Settings, Study
-from crowdmap_torch.studies.tasks import MeasureMap, Task
-
-OURS = MapperConfig()
+from crowdmap_torch.studies.tasks import Task
 
 
 def _adjusted_with(**changes: float) -> MapperConfig:
@@ -37,10 +35,11 @@ VARIANTS: Mapping[str, MapperConfig] = {
         OURS, crowd=replace(OURS.crowd, method="paper2017")
     ),
     "biases from mean differences": replace(
-        OURS,
-        crowd=replace(OURS.crowd, align=replace(OURS.crowd.align, method="paper2017")),
+        OURS, crowd=replace(OURS.crowd, align=replace(OURS.crowd.align, method="paper2017"))
     ),
-    "nothing brought back": replace(OURS, harvest=replace(OURS.harvest, reach_m=0.0)),
+    "nothing brought back": replace(
+        OURS, complete_tracks=replace(OURS.complete_tracks, reach_m=0.0)
+    ),
     "adjustment without drift": _adjusted_with(drift_spacing_m=1e6),
     "adjustment without lanes": _adjusted_with(max_ground_distance_m=0.0),
     "adjustment without innovations": _adjusted_with(innovation_chance=0.0),
@@ -64,27 +63,22 @@ _NUMBERS = {
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """A map for each variant and seed."""
-    for config in VARIANTS.values():
-        for task in _maps(settings.scale, config):
-            yield 2 + SHORT_TURNS * task.simulation.seed, task
+    return in_short_turns(2, (short_maps(settings.scale, c) for c in VARIANTS.values()))
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """The figures of each variant."""
     rows, bars = [], {}
     for name, config in VARIANTS.items():
-        found = results(_maps(settings.scale, config), folder)
-        values = {title: spread(numbers(found, path)) for title, path in _NUMBERS.items()}
+        found = results(short_maps(settings.scale, config), folder)
+        values = spreads(found, _NUMBERS)
         rows.append((name, *(value.mean for value in values.values()), len(found)))
-        relative, width = values["relative [m]"], values["lane width [m]"]
         bars[name] = {
-            "relative corner error": (relative.mean, relative.std),
-            "lane width": (width.mean, width.std),
+            "relative corner error": values["relative [m]"].bar,
+            "lane width": values["lane width [m]"].bar,
         }
     scale = settings.scale
     return Chapter(
-        "ablation",
-        "Each idea switched off",
         text=(
             f"{scale.short_journeys} journeys of {scale.short_road.length_m:.0f} m; everything else stays ours. Means "
             "over seeds, bars 1-sigma over them.",
@@ -92,13 +86,6 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         tables=(Table("ablation", ("without", *_NUMBERS, "seeds"), tuple(rows)),),
         plots={"ablation": plot_bars(bars, x="mean error [m]")},
     )
-
-
-def _maps(scale: Scale, config: MapperConfig) -> list[MeasureMap]:
-    return [
-        MeasureMap(scale.short_drives(seed), scale.short_journeys, config=config)
-        for seed in range(scale.short_seeds)
-    ]
 
 
 STUDY = Study("ablation", "Each idea switched off", tasks, chapter)

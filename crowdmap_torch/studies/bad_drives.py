@@ -8,9 +8,10 @@ from dataclasses import replace
 from crowdmap_torch.simulate.faults import KINDS
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import plot_bars
+from crowdmap_torch.studies.fleet import in_short_turns, short_maps
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import Result, numbers, results, spread
-from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
+from crowdmap_torch.studies.numbers import Result, results, spreads
+from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureMap, Task
 
@@ -28,9 +29,7 @@ _NUMBERS = {
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """A map for each fault and seed, and one without any."""
-    for kind in _kinds(settings.scale):
-        for task in _maps(settings.scale, kind):
-            yield 4 + SHORT_TURNS * task.simulation.seed, task
+    return in_short_turns(4, (_maps(settings.scale, kind) for kind in _kinds(settings.scale)))
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
@@ -38,18 +37,16 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     scale, rows, bars = settings.scale, [], {}
     for kind in _kinds(scale):
         found = results(_maps(scale, kind), folder)
-        values = {title: spread(numbers(found, path)) for title, path in _NUMBERS.items()}
+        values = spreads(found, _NUMBERS)
         named, wrongly = _named(found)
         means = (value.mean for value in values.values())
         rows.append((kind, f"{named} of {len(found)}" if kind != NONE else "-", wrongly, *means))
         bars[kind] = {
-            "relative": (values["relative [m]"].mean, values["relative [m]"].std),
-            "absolute": (values["absolute [m]"].mean, values["absolute [m]"].std),
+            "relative": values["relative [m]"].bar,
+            "absolute": values["absolute [m]"].bar,
         }
     columns = ("fault", "named", "others named", *_NUMBERS)
     return Chapter(
-        "bad-drives",
-        "Bad drives",
         text=(
             f"{scale.short_journeys} journeys of {scale.short_road.length_m:.0f} m, one of them spoilt. Named: listed "
             "among `suspect_journeys`; such a journey has no say in the map. Wrong positions make the mean of the "
@@ -66,16 +63,13 @@ def _kinds(scale: Scale) -> tuple[str, ...]:
 
 def _maps(scale: Scale, kind: str) -> list[MeasureMap]:
     faults = () if kind == NONE else (kind,)
-    return [
-        MeasureMap(replace(scale.short_drives(seed), bad_drives=faults), scale.short_journeys)
-        for seed in range(scale.short_seeds)
-    ]
+    return short_maps(scale, change=lambda drives: replace(drives, bad_drives=faults))
 
 
 def _named(found: list[Result]) -> tuple[int, int]:
     """Maps that named the bad drive, and good drives that were named in all of them together."""
-    named = sum(set(result["bad"]) <= set(result["suspects"]) for result in found)
-    wrongly = sum(len(set(result["suspects"]) - set(result["bad"])) for result in found)
+    named = sum(set(result["bad"]) <= set(result["outlier_journeys"]) for result in found)
+    wrongly = sum(len(set(result["outlier_journeys"]) - set(result["bad"])) for result in found)
     return named, wrongly
 
 

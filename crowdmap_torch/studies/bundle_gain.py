@@ -42,10 +42,7 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             gain = spread([1 - b / a for a, b in zip(before, after, strict=True)])
             a, b = spread(before), spread(after)
             rows.append((method, error, a.mean, b.mean, gain.mean, gain.low, gain.high, gain.count))
-            bars[f"{method}, {error}"] = {
-                "cluster heads": (a.mean, a.std),
-                "adjusted": (b.mean, b.std),
-            }
+            bars[f"{method}, {error}"] = {"cluster heads": a.bar, "adjusted": b.bar}
     low, high = paper.BUNDLE_GAIN
     columns = (
         "method",
@@ -58,8 +55,6 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         "seeds",
     )
     return Chapter(
-        "bundle-gain",
-        "What bundle adjustment gains",
         text=(
             f"{scale.journeys} journeys. The paper: {low:.0%} to {high:.0%} of the error, within the error margins. "
             "paper2017 has signs alone here, without lanes.",

@@ -36,8 +36,6 @@ class Table:
 class Chapter:
     """A study as it stands: it may have been stopped before all its seeds were done."""
 
-    name: str
-    title: str
     text: tuple[str, ...] = ()
     """Paragraphs."""
     tables: tuple[Table, ...] = ()
@@ -45,15 +43,20 @@ class Chapter:
     """By the name of the file."""
 
 
-def write_chapters(out: Path, name: str, title: str, chapters: Sequence[Chapter]) -> Path:
-    """Writes `tables/*.csv`, `plots/*.png` and the page `NAME.html` with all of it; returns the page."""
-    for chapter in chapters:
+def write_chapters(
+    out: Path, name: str, title: str, chapters: Sequence[tuple[str, str, Chapter]]
+) -> Path:
+    """Writes `tables/*.csv`, `plots/*.png` and the page `NAME.html` with all of it; returns the page.
+
+    Each chapter comes with its name and its title.
+    """
+    for _, _, chapter in chapters:
         for table in chapter.tables:
             _write_csv(out / "tables" / f"{table.name}.csv", table)
         for plot, figure in chapter.plots.items():
             write_png(figure, out / "plots" / f"{plot}.png")
     page = out / f"{name}.html"
-    sections = [(chapter.name, chapter.title, _content(chapter)) for chapter in chapters]
+    sections = [(anchor, heading, _content(chapter)) for anchor, heading, chapter in chapters]
     subtitle = "Ours beside Dabeer et al., An End-to-End System for Crowdsourced 3d Maps (2017)"
     with atomic_file(page) as beside:
         beside.write_text(page_html(title, subtitle, sections), encoding="utf-8")

@@ -13,6 +13,14 @@ from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureMap, Task
 
 PER_KM = 5
+_PINNED = {
+    "with [m]": "map.signs.absolute.total.mean",
+    "horizontal [m]": "map.signs.absolute.horizontal.mean",
+    "vertical [m]": "map.signs.absolute.vertical.mean",
+    "relative [m]": "map.signs.relative.total.mean",
+    "lane lateral [m]": "map.lanes.lateral.mean",
+}
+"""Numbers of the map with control signs."""
 
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
@@ -29,40 +37,17 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         found = results((free, pinned), folder)
         if len(found) < 2:
             continue
-        without, with_them = found
-        at = "map.signs.absolute"
-        errors = {
-            "without": number(without, f"{at}.total.mean"),
-            "with": number(with_them, f"{at}.total.mean"),
-        }
-        seed = free.simulation.seed
-        rows.append(
-            (
-                seed,
-                round(number(with_them, "control_points")),
-                *errors.values(),
-                number(with_them, f"{at}.horizontal.mean"),
-                number(with_them, f"{at}.vertical.mean"),
-                number(with_them, "map.signs.relative.total.mean"),
-                number(with_them, "map.lanes.lateral.mean"),
-                round(number(with_them, f"{at}.total.count")),
-            )
+        without = number(found[0], _PINNED["with [m]"])
+        pinned = {title: number(found[1], path) for title, path in _PINNED.items()}
+        signs, others = (
+            round(number(found[1], path))
+            for path in ("control_points", "map.signs.absolute.total.count")
         )
-        bars[f"seed {seed}"] = {name: (value, 0.0) for name, value in errors.items()}
-    columns = (
-        "seed",
-        "control signs found",
-        "absolute without [m]",
-        "with [m]",
-        "horizontal [m]",
-        "vertical [m]",
-        "relative [m]",
-        "lane lateral [m]",
-        "other signs",
-    )
+        seed = free.simulation.seed
+        rows.append((seed, signs, without, *pinned.values(), others))
+        bars[f"seed {seed}"] = {"without": (without, 0.0), "with": (pinned["with [m]"], 0.0)}
+    columns = ("seed", "control signs found", "absolute without [m]", *_PINNED, "other signs")
     return Chapter(
-        "control",
-        "Control signs",
         text=(
             f"{scale.journeys} journeys, {PER_KM} surveyed signs to a kilometre, far from each other; they are left "
             "out of all figures.",

@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.bundle import Bundle
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.config import MapperConfig
-from crowdmap_torch.evaluation.statistics import plain
+from crowdmap_torch.io.documents import plain
 from crowdmap_torch.mapper import FirstMap, build_bundle, first_map
-from crowdmap_torch.observations import CornerObservations
-from crowdmap_torch.simulate import SimulationConfig
-from crowdmap_torch.stages import adjust
+from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import plot_bars
 from crowdmap_torch.studies.folder import StudyFolder
@@ -31,10 +31,24 @@ OUTLIERS = 0.03
 """Share of detections that are made outliers."""
 OUTLIER_PX = (10.0, 40.0)
 """How far off they are, in any direction."""
+_MOVES = (
+    ("outliers: mean [mm]", "outliers.mean"),
+    ("95 % [mm]", "outliers.p95"),
+    ("max [mm]", "outliers.max"),
+    ("left out: mean [mm]", "left_out.mean"),
+    ("max [mm]", "left_out.max"),
+    ("outliers against left out: mean [mm]", "between.mean"),
+    ("max [mm]", "between.max"),
+    ("a metre off: mean [mm]", "far.mean"),
+    ("max [mm]", "far.max"),
+    ("its poses: mean [mm]", "far_pose_m"),
+)
+"""Columns of the table, and where their numbers [m] are."""
+_DRAWN = {"outliers": "outliers.mean", "left out": "left_out.mean", "a metre off": "far.mean"}
 
 
 @dataclass(frozen=True)
-class MeasureConvergence:
+class MeasureConvergence(Task):
     """How far the adjusted signs move with outliers, without those detections, and from a start a metre off."""
 
     simulation: SimulationConfig
@@ -57,10 +71,6 @@ class MeasureConvergence:
     def needs(self) -> Sequence[Task]:
         """The single journeys."""
         return self._map.needs()
-
-    def is_done(self, folder: StudyFolder) -> bool:
-        """True if it was measured."""
-        return folder.has_result(self.key)
 
     def run(self, folder: StudyFolder) -> None:
         """Adjusts the same map four times."""
@@ -146,11 +156,7 @@ def _adjusted(bundle: Bundle, first: FirstMap, journeys: Sequence[Journey]) -> _
 
 def _moved(before: Tensor, after: Tensor, mask: Tensor) -> dict[str, float]:
     away = (after - before).norm(dim=-1)[mask]
-    return {
-        "mean": float(away.mean()),
-        "p95": float(away.quantile(0.95)),
-        "max": float(away.max()),
-    }
+    return {"mean": float(away.mean()), "p95": float(away.quantile(0.95)), "max": float(away.max())}
 
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
@@ -165,41 +171,15 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     for task in _measured(settings.scale):
         for found in results((task,), folder):
             finite = finite and bool(found["finite"])
-            of_outliers, of_left_out, between, far = (
-                [1000 * number(found, f"{what}.{part}") for part in parts]
-                for what, parts in (
-                    ("outliers", ("mean", "p95", "max")),
-                    ("left_out", ("mean", "max")),
-                    ("between", ("mean", "max")),
-                    ("far", ("mean", "max")),
-                )
-            )
-            pose = 1000 * number(found, "far_pose_m")
-            seed = task.simulation.seed
-            rows.append((seed, *of_outliers, *of_left_out, *between, *far, pose))
-            bars[f"seed {seed}"] = {
-                "outliers": (of_outliers[0], 0.0),
-                "left out": (of_left_out[0], 0.0),
-                "a metre off": (far[0], 0.0),
+            moved = {path: 1000 * number(found, path) for _, path in _MOVES}
+            rows.append((task.simulation.seed, *moved.values()))
+            bars[f"seed {task.simulation.seed}"] = {
+                name: (moved[path], 0.0) for name, path in _DRAWN.items()
             }
-    columns = (
-        "seed",
-        "outliers: mean [mm]",
-        "95 % [mm]",
-        "max [mm]",
-        "left out: mean [mm]",
-        "max [mm]",
-        "outliers against left out: mean [mm]",
-        "max [mm]",
-        "a metre off: mean [mm]",
-        "max [mm]",
-        "its poses: mean [mm]",
-    )
+    columns = ("seed", *(title for title, _ in _MOVES))
     scale = settings.scale
     low, high = OUTLIER_PX
     return Chapter(
-        "convergence",
-        "Do the start and outliers decide?",
         text=(
             f"{scale.journeys} journeys. How far the corners of the adjusted signs move when {100 * OUTLIERS:.0f} % more "
             f"of the detections are {low:.0f} to {high:.0f} pixels off; when the same detections are not there at all, "

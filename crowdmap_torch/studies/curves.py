@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crowdmap_torch.report.plots import INK, SERIES, new_figure, styled
+from crowdmap_torch.studies.numbers import Spread
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,11 @@ class Line:
     sigma: Sequence[float] | None = None
     """Half the length of the error bars."""
     style: str = "-"
+
+
+def line_of(label: str, x: Sequence[float], rows: Sequence[Spread]) -> Line:
+    """A line through means, with their spread."""
+    return Line(label, x, [row.mean for row in rows], [row.std for row in rows])
 
 
 @dataclass(frozen=True)

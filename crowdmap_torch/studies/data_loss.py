@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 from crowdmap_torch.studies import paper
 from crowdmap_torch.studies.chapter import Chapter, Table
-from crowdmap_torch.studies.curves import Line, Panel, Point, plot_lines
+from crowdmap_torch.studies.curves import Panel, Point, line_of, plot_lines
 from crowdmap_torch.studies.fleet import curve, in_turns, our_maps, paper_heads
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import Result, Spread, number, numbers, spread
+from crowdmap_torch.studies.numbers import Result, Spread, number, spread, spread_of
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import Task
 
@@ -39,17 +39,23 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         "paper2017": (within, [_left_out(maps) for maps in theirs]),
     }
     lost = {
-        "ours": (counts, [_lost(maps, "map") for maps in ours]),
-        "ours, before adjustment": (counts, [_lost(maps, "heads") for maps in ours]),
-        "paper2017": (within, [_lost(maps, "heads") for maps in theirs]),
+        "ours": (counts, [spread_of(maps, "map.association.data_loss") for maps in ours]),
+        "ours, before adjustment": (
+            counts,
+            [spread_of(maps, "heads.association.data_loss") for maps in ours],
+        ),
+        "paper2017": (within, [spread_of(maps, "heads.association.data_loss") for maps in theirs]),
     }
     panels = [
         Panel(
             "signs of single journeys left out by clustering",
-            _lines(left_out),
+            [line_of(name, *found) for name, found in left_out.items()],
             [Point("the paper's drives", paper.LOSS_FROM_JOURNEYS, paper.DATA_LOSS)],
         ),
-        Panel("detections of observable signs in no landmark", _lines(lost)),
+        Panel(
+            "detections of observable signs in no landmark",
+            [line_of(name, *found) for name, found in lost.items()],
+        ),
     ]
     columns = ("journeys", "method", "measure", "share", "1-sigma over maps", "most", "maps")
     rows = tuple(
@@ -59,8 +65,6 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         for count, row in zip(at, values, strict=True)
     )
     return Chapter(
-        "data-loss",
-        "Data loss",
         text=(
             "Left: the share of the single journeys' signs that end as singletons, the paper's measure; false signs, "
             "which belong there, are among them. Right: the share of the detections of observable true signs that are "
@@ -77,17 +81,6 @@ def _left_out(found: list[Result]) -> Spread:
         for result in found
     ]
     return spread(shares)
-
-
-def _lost(found: list[Result], stage: str) -> Spread:
-    return spread(numbers(found, f"{stage}.association.data_loss"))
-
-
-def _lines(found: dict[str, tuple[list[int], list[Spread]]]) -> list[Line]:
-    return [
-        Line(name, at, [row.mean for row in rows], [row.std for row in rows])
-        for name, (at, rows) in found.items()
-    ]
 
 
 STUDY = Study("data-loss", "Data loss", tasks, chapter)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import fmean
 
 from crowdmap_torch.evaluation.signs import evaluate_signs
-from crowdmap_torch.evaluation.statistics import plain
 from crowdmap_torch.evaluation.visibility import observable_signs
+from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.maps import read_map
-from crowdmap_torch.simulate import SimulationConfig
+from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, plot_lines
+from crowdmap_torch.studies.fleet import honest_maps
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.linear_map import linear_map
 from crowdmap_torch.studies.measure import load_drives
@@ -28,7 +29,7 @@ ASKED = {"relative": 1.2, "absolute": 1.1}
 
 
 @dataclass(frozen=True)
-class MeasureLinear:
+class MeasureLinear(Task):
     """What the linear estimator makes of the drives."""
 
     simulation: SimulationConfig
@@ -46,10 +47,6 @@ class MeasureLinear:
     def needs(self) -> Sequence[Task]:
         """The dataset."""
         return (Simulate(self.simulation),)
-
-    def is_done(self, folder: StudyFolder) -> bool:
-        """True if it was measured."""
-        return folder.has_result(self.key)
 
     def run(self, folder: StudyFolder) -> None:
         """Estimates the signs that count and measures them."""
@@ -104,8 +101,6 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     )
     scale = settings.scale
     return Chapter(
-        "efficiency",
-        "How far from the best possible?",
         text=(
             f"{len(done)} data sets of {scale.honest_journeys} journeys on {scale.short_road.length_m:.0f} m of road. The "
             "linear estimator is told what every detection shows, which ones are outliers, all noise levels and the "
@@ -125,11 +120,7 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
 
 
 def _pairs(scale: Scale) -> list[tuple[MeasureMap, MeasureLinear]]:
-    drives = [
-        replace(scale.short_drives(seed), journeys=scale.honest_journeys)
-        for seed in range(scale.linear_sets)
-    ]
-    return [(MeasureMap(d, scale.honest_journeys), MeasureLinear(d)) for d in drives]
+    return [(m, MeasureLinear(m.simulation)) for m in honest_maps(scale, scale.linear_sets)]
 
 
 STUDY = Study("efficiency", "How far from the best possible?", tasks, chapter)

@@ -1,17 +1,41 @@
-"""The maps that several studies look at: many drives on one road, by the number of journeys."""
+"""The maps that several studies look at: many drives on one road, by the number of journeys or by what is varied."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.numbers import Result, results
-from crowdmap_torch.studies.scale import Scale
+from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
 from crowdmap_torch.studies.tasks import MeasureMap
 
 OURS = MapperConfig()
 PAPER = MapperConfig(method="paper2017")
+
+
+def short_maps(
+    scale: Scale,
+    config: MapperConfig = OURS,
+    change: Callable[[SimulationConfig], SimulationConfig] = lambda drives: drives,
+) -> list[MeasureMap]:
+    """Maps of the short road, seed by seed, of drives that `change` may worsen."""
+    return [
+        MeasureMap(change(scale.short_drives(seed)), scale.short_journeys, config=config)
+        for seed in range(scale.short_seeds)
+    ]
+
+
+def honest_maps(scale: Scale, sets: int) -> list[MeasureMap]:
+    """Maps of more journeys on the short road, data set by data set: for what is said of their covariances."""
+    return [
+        MeasureMap(
+            replace(scale.short_drives(seed), journeys=scale.honest_journeys), scale.honest_journeys
+        )
+        for seed in range(sets)
+    ]
 
 
 def our_maps(scale: Scale, count: int) -> list[MeasureMap]:
@@ -62,6 +86,15 @@ def curve(
         )
         for count, tasks in maps.items()
     }
+
+
+def in_short_turns(
+    first: int, variants: Iterable[Sequence[MeasureMap]]
+) -> Iterator[tuple[int, MeasureMap]]:
+    """The maps of all variants with their turns, seed after seed from turn `first` on."""
+    for maps in variants:
+        for task in maps:
+            yield first + SHORT_TURNS * task.simulation.seed, task
 
 
 def in_turns(scale: Scale, maps: Iterable[MeasureMap]) -> Iterator[tuple[int, MeasureMap]]:

@@ -14,10 +14,18 @@ from typing import Any
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.io.documents import write_json
+from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.mapper import JourneyMap
-from crowdmap_torch.simulate import SimulationConfig
+from crowdmap_torch.simulate.dataset import SimulationConfig
 
-_JOURNEY_PART = ("sign_association", "lane_association", "sign_triangulation", "road", "lane")
+_JOURNEY_PART = (
+    "positioning",
+    "sign_association",
+    "lane_association",
+    "sign_triangulation",
+    "road",
+    "lane",
+)
 """What a configuration says of single journeys: those with these alike share the maps of their journeys."""
 
 
@@ -29,9 +37,9 @@ class StudyFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        """ValueError if `path` is a file."""
+        """InputError if `path` is a file."""
         if path.exists() and not path.is_dir():
-            raise ValueError(f"{path}: is a file; --out names a folder")
+            raise InputError(f"{path}: is a file; --out names a folder")
         self.path = path
 
     def dataset(self, simulation: SimulationConfig) -> Path:

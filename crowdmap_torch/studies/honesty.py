@@ -2,96 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+import math
+from collections.abc import Iterator, Mapping
 
 from scipy.stats import chi2
 
-from crowdmap_torch.studies.chapter import Chapter, Table
+from crowdmap_torch.studies.chapter import Cell, Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, plot_lines
+from crowdmap_torch.studies.fleet import honest_maps
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.numbers import numbers, results
-from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
+from crowdmap_torch.studies.scale import SHORT_TURNS
 from crowdmap_torch.studies.study import Settings, Study
-from crowdmap_torch.studies.tasks import MeasureMap, Task
+from crowdmap_torch.studies.tasks import Task
 
 COVERED = (0.92, 0.98)
 """Where the share inside the 95 % ellipsoid, or inside 1.96 sigma, is to lie."""
 _CENTER_FREEDOM = 3
+_NUMBERS = {
+    "signs": "map.uncertainty.signs",
+    "coverage": "map.uncertainty.coverage",
+    "nees": "map.uncertainty.mean_nees",
+    "shared": "map.uncertainty.shared_nees",
+    "drawn": "shared.drawn_nees",
+    "expected": "shared.expected_nees",
+    "lanes": "map.lanes.sigma_coverage",
+    "length": "map.lanes.seen_length_m",
+}
+_COLUMNS = (
+    "seed",
+    "signs",
+    "inside [%]",
+    "mean NEES",
+    "shared NEES",
+    "the draw's",
+    "lanes inside [%]",
+)
+_PERCENT = ("coverage", "lanes")
+Values = Mapping[str, list[float]]
+"""Of each data set, by the names of `_NUMBERS`."""
 
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """One map for each seed."""
-    for task in _maps(settings.scale):
+    for task in honest_maps(settings.scale, settings.scale.honest_sets):
         yield SHORT_TURNS + task.simulation.seed, task
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """Coverage over all data sets, and the shared part's normalised squared error."""
-    found = results(_maps(settings.scale), folder)
-    signs, coverage, nees, shared, drawn, expected, lanes, length = (
-        numbers(found, path)
-        for path in (
-            "map.uncertainty.signs",
-            "map.uncertainty.coverage",
-            "map.uncertainty.mean_nees",
-            "map.uncertainty.shared_nees",
-            "shared.drawn_nees",
-            "shared.expected_nees",
-            "map.lanes.sigma_coverage",
-            "map.lanes.seen_length_m",
-        )
-    )
-    sets = len(found)
-    low, high = (
-        (chi2.ppf((0.025, 0.975), _CENTER_FREEDOM * sets) / sets) if sets else (float("nan"),) * 2
-    )
-    asked = f"{100 * COVERED[0]:.0f} to {100 * COVERED[1]:.0f} %"
-    rows = (
-        ("sign centres inside their 95 % ellipsoid [%]", 100 * _weighted(coverage, signs), asked),
-        ("their mean normalised squared error", _weighted(nees, signs), f"{_CENTER_FREEDOM}"),
-        (
-            "the shared part's, mean over the data sets",
-            _weighted(shared, [1.0] * sets),
-            f"{low:.2f} to {high:.2f}",
-        ),
-        (
-            "the same of the draw: mean pose errors against their true sigmas",
-            _weighted(drawn, [1.0] * sets),
-            "",
-        ),
-        (
-            "the shared part's, in the mean over all draws by those sigmas",
-            _weighted(expected, [1.0] * sets),
-            f"{_CENTER_FREEDOM}",
-        ),
-        ("lane points inside 1.96 sigma [%]", 100 * _weighted(lanes, length), asked),
-    )
-    of_sets = tuple(
-        (number, int(n), 100 * c, e, s, d, 100 * line)
-        for number, (n, c, e, s, d, line) in enumerate(
-            zip(signs, coverage, nees, shared, drawn, lanes, strict=True)
-        )
-    )
-    seeds = list(range(sets))
-    panels = [
-        Panel("share inside 95 % [%]", [
-            Line("sign centres", seeds, [100 * c for c in coverage]),
-            Line("lane points", seeds, [100 * c for c in lanes]),
-        ]),
-        Panel("normalised squared error", [
-            Line("sign centres, mean", seeds, nees),
-            Line("shared part", seeds, shared),
-            Line("the draw", seeds, drawn),
-        ]),
-    ]  # fmt: skip
     scale = settings.scale
+    found = results(honest_maps(scale, scale.honest_sets), folder)
+    values = {
+        name: [(100 if name in _PERCENT else 1) * value for value in numbers(found, path)]
+        for name, path in _NUMBERS.items()
+    }
     return Chapter(
-        "honesty",
-        "Does the map know how wrong it is?",
         text=(
-            f"{sets} data sets of {scale.honest_journeys} journeys on {scale.short_road.length_m:.0f} m of road. The mean "
-            "shift of all signs is the part that all journeys share; what is left is compared with the covariances "
+            f"{len(found)} data sets of {scale.honest_journeys} journeys on {scale.short_road.length_m:.0f} m of road. "
+            "The mean shift of all signs is the part that all journeys share; what is left is compared with the covariances "
             "without that part. Within one data set errors go together, as they come from the slow drift of a few "
             "journeys: it has few independent errors, however many signs stand there, and single sets scatter widely. "
             "The draw: the mean of the poses' true errors against the sigmas that they were drawn from, which is what the "
@@ -99,39 +68,64 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             "of the shared part beside those sigmas, whatever was drawn.",
         ),
         tables=(
-            Table("honesty", ("", "found", "asked"), rows),
-            Table(
-                "honesty-sets",
-                (
-                    "seed",
-                    "signs",
-                    "inside [%]",
-                    "mean NEES",
-                    "shared NEES",
-                    "the draw's",
-                    "lanes inside [%]",
-                ),
-                of_sets,
-            ),
+            Table("honesty", ("", "found", "asked"), _over_all_sets(values)),
+            Table("honesty-sets", _COLUMNS, _set_by_set(values)),
         ),
-        plots={"honesty": plot_lines(panels, x="seed", y="")},
+        plots={"honesty": plot_lines(_panels(values), x="seed", y="")},
     )
+
+
+def _over_all_sets(values: Values) -> tuple[tuple[Cell, ...], ...]:
+    """What is judged, what was found of it in the mean over all data sets, and what is asked."""
+    sets = len(values["signs"])
+    low, high = chi2.ppf((0.025, 0.975), _CENTER_FREEDOM * sets) / sets if sets else 2 * (math.nan,)
+    asked = f"{100 * COVERED[0]:.0f} to {100 * COVERED[1]:.0f} %"
+    signs, metres, alike = values["signs"], values["length"], [1.0] * sets
+    judged = (
+        ("sign centres inside their 95 % ellipsoid [%]", "coverage", signs, asked),
+        ("their mean normalised squared error", "nees", signs, f"{_CENTER_FREEDOM}"),
+        ("the shared part's, mean over the data sets", "shared", alike, f"{low:.2f} to {high:.2f}"),
+        ("the same of the draw: mean pose errors against their true sigmas", "drawn", alike, ""),
+        (
+            "the shared part's, in the mean over all draws by those sigmas",
+            "expected",
+            alike,
+            f"{_CENTER_FREEDOM}",
+        ),
+        ("lane points inside 1.96 sigma [%]", "lanes", metres, asked),
+    )
+    return tuple(
+        (title, _weighted(values[name], weight), said) for title, name, weight, said in judged
+    )
+
+
+def _set_by_set(values: Values) -> tuple[tuple[Cell, ...], ...]:
+    columns = (values[name] for name in ("signs", "coverage", "nees", "shared", "drawn", "lanes"))
+    return tuple(
+        (number, int(signs), *others)
+        for number, (signs, *others) in enumerate(zip(*columns, strict=True))
+    )
+
+
+def _panels(values: Values) -> list[Panel]:
+    seeds = list(range(len(values["signs"])))
+    drawn = {
+        "share inside 95 % [%]": {"sign centres": "coverage", "lane points": "lanes"},
+        "normalised squared error": {
+            "sign centres, mean": "nees",
+            "shared part": "shared",
+            "the draw": "drawn",
+        },
+    }
+    return [
+        Panel(title, [Line(label, seeds, values[name]) for label, name in lines.items()])
+        for title, lines in drawn.items()
+    ]
 
 
 def _weighted(values: list[float], weights: list[float]) -> float:
     total = sum(weights)
-    return (
-        sum(v * w for v, w in zip(values, weights, strict=True)) / total if total else float("nan")
-    )
-
-
-def _maps(scale: Scale) -> list[MeasureMap]:
-    return [
-        MeasureMap(
-            replace(scale.short_drives(seed), journeys=scale.honest_journeys), scale.honest_journeys
-        )
-        for seed in range(scale.honest_sets)
-    ]
+    return sum(v * w for v, w in zip(values, weights, strict=True)) / total if total else math.nan
 
 
 STUDY = Study("honesty", "Does the map know how wrong it is?", tasks, chapter)

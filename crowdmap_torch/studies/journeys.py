@@ -19,6 +19,7 @@ from crowdmap_torch.studies.numbers import (
     results,
     seconds,
     spread,
+    spread_of,
 )
 from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study
@@ -60,8 +61,6 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     theirs = curve(scale, heads, folder)
     alone = results(_single_journeys(scale), folder)
     return Chapter(
-        "journeys",
-        "Errors over the number of journeys",
         text=(
             "Mean errors against the exact survey. Bars: 1-sigma over the signs of all seeds, as in the paper. The "
             "statistical bound is the mean error of one journey's own signs divided by the root of the number of "
@@ -105,13 +104,20 @@ def shared_bias_m(positioning: PositioningConfig) -> float:
 
 def statistical_bound(alone: Sequence[Result], path: str, count: int, shared_m: float) -> float:
     """What is left of the error of one journey when `count` independent ones are averaged."""
-    one = spread(numbers(alone, f"signs.{path}.mean")).mean
+    one = spread_of(alone, f"signs.{path}.mean").mean
     return math.hypot(one / math.sqrt(count), shared_m)
 
 
 def _single_journeys(scale: Scale) -> list[Task]:
     """The journeys of the datasets that the curves are drawn from."""
     return [journey for task in our_maps(scale, scale.journeys) for journey in task.journeys()]
+
+
+def _line(label: str, found: dict[int, list[Result]], at: str, style: str = "-") -> Line:
+    """Means over the number of journeys; a solid line with its 1-sigma."""
+    mean = [spread_of(maps, f"{at}.mean").mean for maps in found.values()]
+    sigma = [pooled_std(maps, at) for maps in found.values()] if style == "-" else None
+    return Line(label, list(found), mean, sigma, style)
 
 
 def _sign_panel(
@@ -125,44 +131,30 @@ def _sign_panel(
     counts = list(ours)
     shared = shared_bias_m(scale.drives(0).positioning) if name != "relative" else 0.0
 
-    def line(label: str, found: dict[int, list[Result]], at: str, style: str = "-") -> Line:
-        mean = [spread(numbers(maps, f"{at}.mean")).mean for maps in found.values()]
-        sigma = [pooled_std(maps, at) for maps in found.values()] if style == "-" else None
-        return Line(label, list(found), mean, sigma, style)
-
     bound = [statistical_bound(alone, path, count, shared) for count in counts]
     lines = [
-        line("ours", ours, f"map.signs.{path}"),
-        line("paper2017, cluster heads", theirs, f"heads.signs.{path}"),
-        line("average of single journeys", ours, f"average.{path}", "--"),
+        _line("ours", ours, f"map.signs.{path}"),
+        _line("paper2017, cluster heads", theirs, f"heads.signs.{path}"),
+        _line("average of single journeys", ours, f"average.{path}", "--"),
         Line("statistical bound", counts, bound, style=":"),
     ]
     if name != "relative":
         part = path.removeprefix("absolute.")
-        lines.append(line("oracle", ours, f"map.oracle.{part}", "-."))
+        lines.append(_line("oracle", ours, f"map.oracle.{part}", "-."))
     said = {"absolute": paper.ABSOLUTE_M, "relative": paper.RELATIVE_M}
     points = [Point("the paper's drives", paper.JOURNEYS, said[name])] if name in said else []
     return Panel(f"{name} error of sign corners", lines, points)
 
 
 def _lane_panel(name: str, part: str, ours: dict[int, list[Result]]) -> Panel:
-    counts = list(ours)
-    lines = []
-    for label, stage in (("ours", "map"), ("ours, before adjustment", "heads")):
-        at = f"{stage}.lanes.{part}"
-        mean = [spread(numbers(maps, f"{at}.mean")).mean for maps in ours.values()]
-        sigma = [pooled_std(maps, at) for maps in ours.values()] if stage == "map" else None
-        lines.append(Line(label, counts, mean, sigma, "-" if stage == "map" else "--"))
-    if counts:
+    lines = [
+        _line("ours", ours, f"map.lanes.{part}"),
+        _line("ours, before adjustment", ours, f"heads.lanes.{part}", "--"),
+    ]
+    if counts := list(ours):
         one = lines[0].y[0] * math.sqrt(counts[0])
-        lines.append(
-            Line(
-                "of one journey / root of n",
-                counts,
-                [one / math.sqrt(n) for n in counts],
-                style=":",
-            )
-        )
+        ideal = [one / math.sqrt(n) for n in counts]
+        lines.append(Line("of one journey / root of n", counts, ideal, style=":"))
     return Panel(name, lines)
 
 
@@ -170,27 +162,20 @@ def _target_table(scale: Scale, folder: StudyFolder) -> Table:
     """What issue and paper ask for, and what was measured, over all seeds at the number that counts."""
     ours = results(our_maps(scale, scale.journeys), folder)
     heads = results(paper_heads(scale, scale.journeys, seeds=scale.seeds), folder)
-    relative = numbers(ours, "map.signs.relative.total.mean")
-    relative_heads = spread(numbers(heads, "heads.signs.relative.total.mean")).mean
+    absolute, relative, oracle = (
+        numbers(ours, f"map.{of}.total.mean")
+        for of in ("signs.absolute", "signs.relative", "oracle")
+    )
+    relative_heads = numbers(heads, "heads.signs.relative.total.mean")
+    taken_off = [1 - r / spread(relative_heads).mean for r in relative]
+    gain = "{} to {}".format(*paper.BUNDLE_GAIN)
     rows = (
-        (
-            "absolute error [m]",
-            f"{paper.ABSOLUTE_M}",
-            numbers(ours, "map.signs.absolute.total.mean"),
-        ),
-        ("oracle [m]", "", numbers(ours, "map.oracle.total.mean")),
+        ("absolute error [m]", f"{paper.ABSOLUTE_M}", absolute),
+        ("oracle [m]", "", oracle),
         ("absolute / oracle", "", numbers(ours, "map.absolute_over_oracle")),
         ("relative error [m]", f"{paper.RELATIVE_M}", relative),
-        (
-            "cluster heads of paper2017, relative [m]",
-            f"{paper.RELATIVE_M}",
-            numbers(heads, "heads.signs.relative.total.mean"),
-        ),
-        (
-            "share taken off them",
-            "{} to {}".format(*paper.BUNDLE_GAIN),
-            [1 - r / relative_heads for r in relative],
-        ),
+        ("cluster heads of paper2017, relative [m]", f"{paper.RELATIVE_M}", relative_heads),
+        ("share taken off them", gain, taken_off),
         ("data loss", f"{paper.DATA_LOSS}", numbers(ours, "map.association.data_loss")),
         ("sign recall", "", numbers(ours, "map.signs.recall")),
         ("sign precision", "", numbers(ours, "map.signs.precision")),
@@ -216,25 +201,18 @@ def _curve_table(
     shared = shared_bias_m(scale.drives(0).positioning)
     rows = []
     for count, maps in ours.items():
-        heads = theirs.get(count, [])
         for name, path in ERRORS.items():
-            row = spread(numbers(maps, f"map.signs.{path}.mean"))
-            part = path.removeprefix("absolute.")
-            rows.append(
-                (
-                    count,
-                    name,
-                    row.mean,
-                    pooled_std(maps, f"map.signs.{path}"),
-                    row.std,
-                    spread(numbers(maps, f"heads.signs.{path}.mean")).mean,
-                    spread(numbers(heads, f"heads.signs.{path}.mean")).mean,
-                    spread(numbers(maps, f"average.{path}.mean")).mean,
-                    statistical_bound(alone, path, count, shared if name != "relative" else 0.0),
-                    spread(numbers(maps, f"map.oracle.{part}.mean")).mean,
-                    row.count,
-                )
+            row = spread_of(maps, f"map.signs.{path}.mean")
+            sigma = pooled_std(maps, f"map.signs.{path}")
+            heads = (
+                spread_of(found, f"heads.signs.{path}.mean").mean
+                for found in (maps, theirs.get(count, []))
             )
+            average = spread_of(maps, f"average.{path}.mean").mean
+            bound = statistical_bound(alone, path, count, shared if name != "relative" else 0.0)
+            oracle = spread_of(maps, f"map.oracle.{path.removeprefix('absolute.')}.mean").mean
+            known = (row.mean, sigma, row.std, *heads, average, bound, oracle, row.count)
+            rows.append((count, name, *known))
     columns = (
         "journeys",
         "error",
@@ -255,8 +233,8 @@ def _lane_table(ours: dict[int, list[Result]]) -> Table:
     rows = []
     for count, maps in ours.items():
         for name, part in LANES.items():
-            row = spread(numbers(maps, f"map.lanes.{part}.mean"))
-            before = spread(numbers(maps, f"heads.lanes.{part}.mean")).mean
+            row = spread_of(maps, f"map.lanes.{part}.mean")
+            before = spread_of(maps, f"heads.lanes.{part}.mean").mean
             sigma = pooled_std(maps, f"map.lanes.{part}")
             rows.append((count, name, row.mean, sigma, row.std, before, row.count))
     columns = (

@@ -15,27 +15,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.bundle import AdjustConfig, Bundle
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.bundle import AdjustConfig, Bundle
 from crowdmap_torch.evaluation.visibility import observable_signs
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.io.truth import JourneyTruth, Truth
-from crowdmap_torch.observations import CornerObservations
-from crowdmap_torch.optim.linearize import linearize, rows
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim.linearize import linearize, rows, sum_of_products
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.optim.robust import Quadratic
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.simulate.positioning import PositioningConfig
-from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
-from crowdmap_torch.stages import adjust
-from crowdmap_torch.tables import (
-    Association,
-    ControlPoints,
-    Journey,
-    Lanes,
-    RoadEstimate,
-    Signs,
-    Survey,
-)
+from crowdmap_torch.tables import Association, ControlPoints, Lanes, RoadEstimate, Signs, Survey
 
 CONTROL_SPACING_M = 8.0
 """Distance between the control points of the true lanes."""
@@ -72,7 +63,10 @@ def linear_map(
         row = row[seen]
         bundle = _bundle_at_truth(truth, survey, true_signs, row)
     signs = true_signs[row]
-    information, force = _prior(bundle)
+    # What holds the landmarks where observations do not, as in our adjustment.
+    information, force = _normal_equations(
+        bundle, list(bundle.fixed.values()), poses=0, first_pose=0
+    )
     for number, journey in enumerate(truth.journeys):
         own, push = _of_journey(bundle, truth, number, journey, simulation)
         information += own
@@ -121,7 +115,8 @@ def _bundle_at_truth(
     config = AdjustConfig(keyframe_spacing_m=0.25, points_per_detection=24)
     associations = [_association(t, signs, of_survey) for t in truth.journeys]
     lanes = _true_lanes(survey)
-    bundle = adjust.build(journeys, roads, signs, lanes, associations, drifts, config)
+    noise = PositioningNoise()
+    bundle = adjust.build(journeys, roads, signs, lanes, associations, drifts, noise, config)
     bundle.refresh()
     return bundle
 
@@ -133,19 +128,15 @@ def _association(truth: JourneyTruth, signs: Signs, of_survey: Tensor) -> Associ
     row = torch.where((row >= 0) & (signs.shape[row] == journey.signs.shape), row, -1)
     seen = torch.nonzero(row >= 0)[:, 0]
     of = signs[row[seen]]
-    px = _true_pixels(journey, truth.T_world_camera[journey.signs.frame[seen]], of.corners_world)
+    T_camera_world = se3.inverse(truth.T_world_camera[journey.signs.frame[seen]])
+    px, _ = camera.project(
+        journey.rig.camera, se3.transform(T_camera_world[:, None], of.corners_world)
+    )
     shift = torch.zeros_like(row)
     shift[seen], _ = polygon.best_shift(
         px, journey.signs.corners_px[seen], polygon.corner_count(of.shape)
     )
     return Association(row, shift, torch.full_like(journey.lanes.row, -1))
-
-
-def _true_pixels(journey: Journey, T_world_camera: Tensor, corners_world: Tensor) -> Tensor:
-    px, _ = camera.project(
-        journey.rig.camera, se3.transform(se3.inverse(T_world_camera)[:, None], corners_world)
-    )
-    return px
 
 
 def _true_lanes(survey: Survey) -> Lanes:
@@ -176,11 +167,6 @@ def _true_lanes(survey: Survey) -> Lanes:
         confidence=count.to(point),
         control=ControlPoints(point, torch.full_like(point[:, 0], math.nan)),
     )
-
-
-def _prior(bundle: Bundle) -> tuple[Tensor, Tensor]:
-    """Information and force on the landmarks by what holds them where observations do not, as in our adjustment."""
-    return _normal_equations(bundle, list(bundle.fixed.values()), poses=0, first_pose=0)
 
 
 def _columns(bundle: Bundle) -> dict[str, int]:
@@ -225,23 +211,18 @@ def _true_terms(
         return rows(replace(term, weight=weight, loss=Quadratic()), own)
 
     corner, lane = terms["sign_reprojection"], terms["lane_reprojection"]
-    sigma = _true_sigma(bundle, bundle.corners, simulation.signs)
+    # By the size of the box, which noise hardly changes.
+    signs, box_px = simulation.signs, bundle.corners.box_px
+    sigma = signs.pixel_noise_px * (1 + (signs.small_box_px / box_px).square()).sqrt()
     every = torch.ones_like(sigma, dtype=torch.bool)
     valid = bundle.matches.valid
     kinds, values = dict(bundle.variables), bundle.values()
     exact = torch.full_like(bundle.matches.t, 1 / simulation.lanes.lane_noise_px)
-    error = linearize(replace(lane, weight=exact), kinds, values).residual[:, 0].abs()
+    error = linearize(replace(lane, weight=exact), kinds, values).residual[0].abs()
     return (
         of_journey(corner, 1 / sigma, every),
         of_journey(lane, exact, valid & (error < _OUTLIER_SIGMAS)),
     )
-
-
-def _true_sigma(
-    bundle: Bundle, rows: CornerObservations, config: SignDetectionConfig
-) -> Float[Tensor, " m"]:
-    """The noise that the simulation gave each corner [px]: by the size of the box, which noise hardly changes."""
-    return config.pixel_noise_px * (1 + (config.small_box_px / rows.box_px).square()).sqrt()
 
 
 def _normal_equations(
@@ -255,15 +236,16 @@ def _normal_equations(
         linear = linearize(term, kinds, values)
         at = []
         for (name, index), block in zip(term.slots, linear.jacobians, strict=True):
-            k = block.shape[-1]
+            k = block.shape[1]
             start = (index - first_pose) * k
             if name != "pose":
                 start = 6 * poses + columns[name] + index * k
-            at.append(start[:, None] + torch.arange(k))
-        column, J = torch.cat(at, dim=1), torch.cat(linear.jacobians, dim=-1)
-        gradient.index_add_(0, column.flatten(), (J.mT @ linear.residual[..., None]).flatten())
-        place = column[:, :, None] * total + column[:, None]
-        hessian.view(-1).index_add_(0, place.flatten(), (J.mT @ J).flatten())
+            at.append(start + torch.arange(k)[:, None])
+        column, J = torch.cat(at), torch.cat(linear.jacobians, dim=1)
+        pulled = sum_of_products(J, linear.residual[:, None])
+        gradient.index_add_(0, column.flatten(), pulled.flatten())
+        place = column[:, None] * total + column
+        hessian.view(-1).index_add_(0, place.flatten(), sum_of_products(J, J).flatten())
     return hessian, gradient
 
 

@@ -13,31 +13,24 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.benchmark.association import sign_associations
 from crowdmap_torch.clustering.groups import group_mode
 from crowdmap_torch.config import MapperConfig
-from crowdmap_torch.evaluate import MapFigures, evaluate_map
+from crowdmap_torch.crowd_signs.cluster import sign_heads
+from crowdmap_torch.evaluation.evaluate import evaluate_map
+from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.signs import SignFigures, evaluate_signs
 from crowdmap_torch.evaluation.single_journey import JourneyLandmarks, evaluate_single_journeys
-from crowdmap_torch.evaluation.statistics import plain
 from crowdmap_torch.evaluation.visibility import MIN_FRAMES, MIN_JOURNEYS, frames_of_signs
 from crowdmap_torch.io.datasets import load_dataset
-from crowdmap_torch.io.documents import read_json
+from crowdmap_torch.io.documents import plain, read_json
+from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import JourneyTruth, Truth, read_truth
-from crowdmap_torch.mapper import (
-    FirstMap,
-    JourneyMap,
-    build_bundle,
-    certain_part,
-    clusters_map,
-    finish_map,
-    first_map,
-)
-from crowdmap_torch.pose_prior import variance_of_mean
+from crowdmap_torch.mapper import JourneyMap, build_bundle, clusters_map, finish_map, first_map
+from crowdmap_torch.noise.pose_prior import variance_of_mean
 from crowdmap_torch.simulate.positioning import PositioningConfig
-from crowdmap_torch.stages import adjust
-from crowdmap_torch.stages.cluster import sign_heads
 from crowdmap_torch.tables import Association, Dataset, HdMap, Survey, concatenate
 
 
@@ -101,13 +94,15 @@ def measure_map(
     hd_map, associations = clusters_map(dataset, first), first.associations
     seconds = {"heads": time.process_time() - begun}
     observable = observable_rows(drives)
-    suspects = [journeys[found.journey].journey_id for found in first.crowd.report.suspects]
+    outliers = [journeys[found.journey].journey_id for found in first.crowd.report.outlier_journeys]
+    label = first.crowd.label
     measured = {
         "heads": _figures(drives, certain_part(hd_map, config.min_confidence), associations),
         "average": plain(averaged_signs(drives, maps, observable)),
-        "clusters": _cluster_counts(first),
+        # The paper's own measure of data loss: signs of single journeys, and those that clustering left out.
+        "clusters": {"signs": len(label), "left_out": int((label < 0).sum())},
         "bad": drives.bad,
-        "suspects": suspects,
+        "outlier_journeys": outliers,
         "seconds": seconds,
     }
     if not adjusted:
@@ -222,9 +217,3 @@ def _figures(
         observable_ids=named,
     )
     return figures.as_dict()
-
-
-def _cluster_counts(first: FirstMap) -> dict[str, int]:
-    """The paper's own measure of data loss: signs of single journeys, and those that clustering left out."""
-    label = first.crowd.label
-    return {"signs": len(label), "left_out": int((label < 0).sum())}

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from crowdmap_torch.simulate import SimulationConfig
+from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.studies.chapter import Chapter, Table
-from crowdmap_torch.studies.curves import Line, Panel, plot_lines
+from crowdmap_torch.studies.curves import Panel, line_of, plot_lines
+from crowdmap_torch.studies.fleet import in_short_turns, short_maps
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import numbers, results, spread
-from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
+from crowdmap_torch.studies.numbers import results, spreads
+from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureMap, Task
 
@@ -89,10 +90,9 @@ _LINES = {
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """A map for each value and seed; that of the defaults counts for every sweep."""
-    for sweep in SWEEPS.values():
-        for value in _values(settings.scale, sweep):
-            for task in _maps(settings.scale, sweep, value):
-                yield 4 + SHORT_TURNS * task.simulation.seed, task
+    scale = settings.scale
+    swept = ((sweep, value) for sweep in SWEEPS.values() for value in _values(scale, sweep))
+    return in_short_turns(4, (_maps(scale, sweep, value) for sweep, value in swept))
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
@@ -101,23 +101,15 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     for name, sweep in SWEEPS.items():
         values = sorted(_values(scale, sweep))
         found = [results(_maps(scale, sweep, value), folder) for value in values]
-        table = {
-            title: [spread(numbers(maps, path)) for maps in found]
-            for title, path in _NUMBERS.items()
-        }
-        for k, value in enumerate(values):
-            means = (column[k].mean for column in table.values())
-            rows.append((name, value, *means, len(found[k])))
+        measured = [spreads(maps, _NUMBERS) for maps in found]
+        for value, maps, row in zip(values, found, measured, strict=True):
+            rows.append((name, value, *(column.mean for column in row.values()), len(maps)))
         lines = [
-            Line(
-                label, values, [row.mean for row in table[title]], [row.std for row in table[title]]
-            )
+            line_of(label, values, [row[title] for row in measured])
             for label, title in _LINES.items()
         ]
         panels.append(Panel(f"{name} ({sweep.unit})", lines))
     return Chapter(
-        "noise",
-        "Worse detections, worse positions",
         text=(
             f"{scale.short_journeys} journeys of {scale.short_road.length_m:.0f} m, one thing varied at a time, signs "
             "and lanes alike. Bars: 1-sigma over seeds.",
@@ -132,13 +124,9 @@ def _values(scale: Scale, sweep: Sweep) -> tuple[float, ...]:
 
 
 def _maps(scale: Scale, sweep: Sweep, value: float) -> list[MeasureMap]:
-    maps = []
-    for seed in range(scale.short_seeds):
-        simulation = scale.short_drives(seed)
-        if value != sweep.default:
-            simulation = sweep.change(simulation, value)
-        maps.append(MeasureMap(simulation, scale.short_journeys))
-    return maps
+    if value == sweep.default:
+        return short_maps(scale)
+    return short_maps(scale, change=lambda drives: sweep.change(drives, value))
 
 
 STUDY = Study("noise", "Worse detections, worse positions", tasks, chapter)

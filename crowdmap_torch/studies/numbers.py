@@ -26,6 +26,11 @@ class Spread:
     high: float
     count: int
 
+    @property
+    def bar(self) -> tuple[float, float]:
+        """Mean and 1-sigma, as they are drawn."""
+        return self.mean, self.std
+
 
 def results(tasks: Iterable[Task], folder: StudyFolder) -> list[Result]:
     """What is measured of `tasks`, in their order."""
@@ -55,6 +60,16 @@ def spread(values: Sequence[float]) -> Spread:
     return Spread(
         float(known.mean()), float(known.std()), float(known.min()), float(known.max()), len(known)
     )
+
+
+def spread_of(found: Sequence[Result], path: str) -> Spread:
+    """Mean and spread of the number at a path."""
+    return spread(numbers(found, path))
+
+
+def spreads(found: Sequence[Result], paths: Mapping[str, str]) -> dict[str, Spread]:
+    """Mean and spread of the number at each path, by its title."""
+    return {title: spread_of(found, path) for title, path in paths.items()}
 
 
 def pooled_std(found: Sequence[Result], path: str) -> float:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import astuple, replace
 
-from crowdmap_torch.simulate import POSITIONING_PRESETS
-from crowdmap_torch.simulate.positioning import PositioningConfig
+from crowdmap_torch.simulate.positioning import POSITIONING_PRESETS, PositioningConfig
 from crowdmap_torch.studies import paper
 from crowdmap_torch.studies.chapter import Chapter, Table
-from crowdmap_torch.studies.curves import Line, Panel, Point, plot_lines
+from crowdmap_torch.studies.curves import Panel, Point, line_of, plot_lines
 from crowdmap_torch.studies.fleet import curve, paper_heads
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import numbers, results, spread
+from crowdmap_torch.studies.numbers import results, spread_of
 from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureMap, Task
@@ -57,14 +56,13 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     rows, panels = [], []
     for error, (low, high) in _ERRORS.items():
         path = f"heads.signs.{error}.total.mean"
-        all_seeds = astuple(spread(numbers(judged, path)))
+        all_seeds = astuple(spread_of(judged, path))
         asked = f"{low:.2f} to {high:.2f}"
         rows.append(("paper, all seeds", error, scale.journeys, *all_seeds, asked))
         lines = []
         for name, by_count in found.items():
-            means = {count: spread(numbers(maps, path)) for count, maps in by_count.items()}
-            values = means.values()
-            lines.append(Line(name, counts, [m.mean for m in values], [m.std for m in values]))
+            means = {count: spread_of(maps, path) for count, maps in by_count.items()}
+            lines.append(line_of(name, counts, list(means.values())))
             rows += [(name, error, count, *astuple(row), "") for count, row in means.items()]
         said = paper.ABSOLUTE_M if error == "absolute" else paper.RELATIVE_M
         point = Point("the paper's drives", paper.JOURNEYS, said)
@@ -82,8 +80,6 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     )
     p = POSITIONING["paper"]
     return Chapter(
-        "preset",
-        "The positioning presets",
         text=(
             f"`paper` is set so that the paper's own method, an average of {paper.JOURNEYS} journeys, has the paper's "
             f"errors: each journey has a constant bias of {p.bias_e_m:.2f}, {p.bias_n_m:.2f} and {p.bias_u_m:.2f} m "

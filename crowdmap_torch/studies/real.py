@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.fleet import OURS, PAPER
 from crowdmap_torch.studies.folder import StudyFolder
@@ -16,6 +17,12 @@ from crowdmap_torch.studies.tasks import MeasureReal, Task
 GATE_M = 2.0
 """A mapped sign further from the surveyed place is not that sign."""
 _METHODS = {"ours": OURS, "paper2017": PAPER}
+_NUMBERS = {
+    "median [m]": "absolute_center.total.median",
+    "mean [m]": "absolute_center.total.mean",
+    "95 % [m]": "absolute_center.total.p95",
+    "relative, mean [m]": "relative_center.total.mean",
+}
 _SIGNS = {"journey": "one journey's signs", "heads": "cluster heads", "map": "adjusted"}
 
 
@@ -27,12 +34,9 @@ def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
-    """The signs of each sequence; ValueError if the folder that was given has none."""
-    title = "Real drives"
+    """The signs of each sequence; InputError if the folder that was given has none."""
     if settings.real is None:
-        return Chapter(
-            "real", title, text=("Left out: `--real DIR` names the folder of kitti-signs.",)
-        )
+        return Chapter(text=("Left out: `--real DIR` names the folder of kitti-signs.",))
     rows = []
     for method, config in _METHODS.items():
         for task in _drives(settings, config):
@@ -43,38 +47,20 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
                 if name != "journey" and method == "paper2017":
                     # To the paper's clustering the signs of one journey are singletons.
                     continue
-                at = f"{name}.signs"
-                rows.append(
-                    (
-                        method,
-                        task.dataset.name,
-                        signs,
-                        round(number(result, "frames")),
-                        round(number(result, f"{at}.observable")),
-                        round(number(result, f"{at}.matched_observable")),
-                        number(result, f"{at}.absolute_center.total.median"),
-                        number(result, f"{at}.absolute_center.total.mean"),
-                        number(result, f"{at}.absolute_center.total.p95"),
-                        number(result, f"{at}.relative_center.total.mean"),
-                        number(result, "seconds"),
+                counts = (
+                    round(number(result, path))
+                    for path in (
+                        "frames",
+                        f"{name}.signs.observable",
+                        f"{name}.signs.matched_observable",
                     )
                 )
-    columns = (
-        "method",
-        "sequence",
-        "signs",
-        "frames",
-        "eligible",
-        "mapped",
-        "median [m]",
-        "mean [m]",
-        "95 % [m]",
-        "relative, mean [m]",
-        "seconds of a core",
-    )
+                errors = (number(result, f"{name}.signs.{path}") for path in _NUMBERS.values())
+                spent = number(result, "seconds")
+                rows.append((method, task.dataset.name, signs, *counts, *errors, spent))
+    counted = ("frames", "eligible", "mapped")
+    columns = ("method", "sequence", "signs", *counted, *_NUMBERS, "seconds of a core")
     return Chapter(
-        "real",
-        title,
         text=(
             "kitti-signs: reference poses, boxes marked in the images, signs measured with LiDAR to about 6 cm; errors of "
             f"sign centres within {GATE_M:g} m. A sign that was passed twice counts by its better pass among one journey's "
@@ -91,7 +77,7 @@ def _drives(settings: Settings, config: MapperConfig) -> list[MeasureReal]:
         return []
     folders = sorted(path.parent for path in settings.real.glob("*/dataset.json"))
     if not folders:
-        raise ValueError(f"{settings.real}: no dataset in it; expected folders with dataset.json")
+        raise InputError(f"{settings.real}: no dataset in it; expected folders with dataset.json")
     # There is one journey in each: what it saw alone is the map.
     alone = replace(config, crowd=replace(config.crowd, min_journeys=1))
     return [MeasureReal(path, settings.real / "eligible.json", GATE_M, alone) for path in folders]

@@ -8,20 +8,15 @@ from dataclasses import replace
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import plot_bars
+from crowdmap_torch.studies.fleet import OURS, in_short_turns, short_maps
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import numbers, results, spread
-from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
+from crowdmap_torch.studies.numbers import results, spread_of
 from crowdmap_torch.studies.study import Settings, Study
-from crowdmap_torch.studies.tasks import MeasureMap, Task
+from crowdmap_torch.studies.tasks import Task
 
 
 def _with(road: str, lane: str) -> MapperConfig:
-    default = MapperConfig()
-    return replace(
-        default,
-        road=replace(default.road, method=road),
-        lane=replace(default.lane, method=lane),
-    )
+    return replace(OURS, road=replace(OURS.road, method=road), lane=replace(OURS.lane, method=lane))
 
 
 VARIANTS: Mapping[str, MapperConfig] = {
@@ -38,8 +33,9 @@ _WITHOUT = {
     "our lanes, our normal": "our lanes, calibration alone",
 }
 """What each is compared with."""
+_ALONE = "single journeys"
 _STAGES = {
-    "single journeys": "clean.lane_width",
+    _ALONE: "clean.lane_width",
     "markers of all journeys": "heads.lanes.width",
     "adjusted": "map.lanes.width",
 }
@@ -47,9 +43,7 @@ _STAGES = {
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """A map for each variant and seed."""
-    for config in VARIANTS.values():
-        for task in _maps(settings.scale, config):
-            yield 2 + SHORT_TURNS * task.simulation.seed, task
+    return in_short_turns(2, (short_maps(settings.scale, c) for c in VARIANTS.values()))
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
@@ -57,17 +51,14 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     widths: dict[str, dict[str, tuple[float, float]]] = {}
     seeds: dict[str, int] = {}
     for name, config in VARIANTS.items():
-        maps = _maps(settings.scale, config)
-        made, alone = (
-            results(maps, folder),
-            results([j for m in maps for j in m.journeys()], folder),
-        )
+        maps = short_maps(settings.scale, config)
+        made = results(maps, folder)
+        alone = results([j for m in maps for j in m.journeys()], folder)
         seeds[name] = len(made)
-        widths[name] = {}
-        for stage, path in _STAGES.items():
-            found = alone if stage == "single journeys" else made
-            row = spread(numbers(found, f"{path}.mean"))
-            widths[name][stage] = (row.mean, row.std)
+        widths[name] = {
+            stage: spread_of(alone if stage == _ALONE else made, f"{path}.mean").bar
+            for stage, path in _STAGES.items()
+        }
     rows = []
     for name, stages in widths.items():
         base = widths.get(_WITHOUT.get(name, ""))
@@ -84,8 +75,6 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     )
     scale = settings.scale
     return Chapter(
-        "road-normal",
-        "The road normal",
         text=(
             f"Mean error of the lane width; {scale.short_journeys} journeys of {scale.short_road.length_m:.0f} m. Each "
             "car is loaded in its own way, up to a degree, and pitches as it drives. Adjustment sees the lanes in the "
@@ -94,13 +83,6 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         tables=(Table("road-normal", columns, tuple(rows)),),
         plots={"road-normal": plot_bars(widths, x="mean error of lane width [m]")},
     )
-
-
-def _maps(scale: Scale, config: MapperConfig) -> list[MeasureMap]:
-    return [
-        MeasureMap(scale.short_drives(seed), scale.short_journeys, config=config)
-        for seed in range(scale.short_seeds)
-    ]
 
 
 STUDY = Study("road-normal", "The road normal", tasks, chapter)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from crowdmap_torch.simulate import POSITIONING_PRESETS, WORLD_PRESETS, SimulationConfig
+from crowdmap_torch.simulate.dataset import SimulationConfig
+from crowdmap_torch.simulate.positioning import POSITIONING_PRESETS
 from crowdmap_torch.simulate.rigs import RigConfig
 from crowdmap_torch.simulate.vehicle import VehicleConfig
-from crowdmap_torch.simulate.worlds import WorldConfig
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, WorldConfig
 
 SHORT_TURNS = 4
 """Turns between the seeds of studies on the short road: many maps of little weight, which wait for the first seeds of
@@ -87,19 +88,15 @@ def without_lanes(simulation: SimulationConfig) -> SimulationConfig:
 
 
 FULL = Scale()
+_HOUSES = replace(
+    WORLD_PRESETS["street"],
+    length_m=100.0,
+    lights_per_km=0.0,
+    signs=replace(WORLD_PRESETS["street"].signs, posts_per_km=60.0),
+)
 QUICK = Scale(
-    road=replace(
-        WORLD_PRESETS["street"],
-        length_m=100.0,
-        lights_per_km=0.0,
-        signs=replace(WORLD_PRESETS["street"].signs, posts_per_km=60.0),
-    ),
-    short_road=replace(
-        WORLD_PRESETS["street"],
-        length_m=60.0,
-        lights_per_km=0.0,
-        signs=replace(WORLD_PRESETS["street"].signs, posts_per_km=60.0),
-    ),
+    road=_HOUSES,
+    short_road=replace(_HOUSES, length_m=60.0),
     vehicle=VehicleConfig(frame_rate_hz=5.0),
     rig=RigConfig(camera="pinhole"),
     counts=(1, 3),

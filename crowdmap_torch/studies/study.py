@@ -72,8 +72,8 @@ def run_studies(name: str, studies: Sequence[Study], options: argparse.Namespace
             run_tasks(tasks, folder, processes=options.processes)
         except KeyboardInterrupt:
             sys.stderr.write(f"\n{INTERRUPTED}\n")
-    chapters = [study.chapter(settings, folder) for study in studies]
-    chapters.append(time_chapter(studies, settings, folder))
+    chapters = [(study.name, study.title, study.chapter(settings, folder)) for study in studies]
+    chapters.append(("times", "Times", time_chapter(studies, settings, folder)))
     title = studies[0].title if len(studies) == 1 else "Studies"
     print(write_chapters(folder.path, name, title, chapters))
     left = len(open_tasks(tasks, folder))
@@ -90,8 +90,6 @@ def time_chapter(studies: Sequence[Study], settings: Settings, folder: StudyFold
         rows.append((study.title, len(keys), _minutes(keys, folder)))
     rows.append(("all, shared work once", len(every), _minutes(every, folder)))
     return Chapter(
-        "times",
-        "Times",
         text=(
             "Minutes of a core for mapping, without simulating and measuring. Studies share work: each has all that it "
             "rests on counted as its own.",

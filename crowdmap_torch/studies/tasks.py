@@ -9,18 +9,19 @@ from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from signal import SIG_DFL, SIGINT, signal
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 
 from crowdmap_torch.config import MapperConfig, config_hash
-from crowdmap_torch.evaluate import evaluate_map
+from crowdmap_torch.evaluation.evaluate import evaluate_map
 from crowdmap_torch.evaluation.evidence import named_in, read_observable_ids
 from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.surveys import read_survey
-from crowdmap_torch.mapper import JourneyMap, build_map, certain_part, map_journey
+from crowdmap_torch.mapper import JourneyMap, build_map, map_journey
 from crowdmap_torch.report.progress import Progress
-from crowdmap_torch.simulate import SimulationConfig, write_dataset
+from crowdmap_torch.simulate.dataset import SimulationConfig, write_dataset
 from crowdmap_torch.studies.folder import StudyFolder, dataset_name, digest, journey_config_hash
 from crowdmap_torch.studies.measure import (
     Drives,
@@ -33,8 +34,9 @@ from crowdmap_torch.studies.measure import (
 _STAGE = "studies, seconds of work"
 
 
+@runtime_checkable
 class Task(Protocol):
-    """A piece of work."""
+    """A piece of work: a dataclass of all that decides what it leaves behind."""
 
     @property
     def key(self) -> str:
@@ -47,12 +49,12 @@ class Task(Protocol):
         ...
 
     def needs(self) -> Sequence[Task]:
-        """What must be done before."""
-        ...
+        """What must be done before; nothing, unless a kind of work says otherwise."""
+        return ()
 
     def is_done(self, folder: StudyFolder) -> bool:
-        """True if it need not be done again."""
-        ...
+        """True if it need not be done again: as a rule, if its result is there."""
+        return folder.has_result(self.key)
 
     def run(self, folder: StudyFolder) -> None:
         """Does it."""
@@ -60,7 +62,7 @@ class Task(Protocol):
 
 
 @dataclass(frozen=True)
-class Simulate:
+class Simulate(Task):
     """A dataset."""
 
     simulation: SimulationConfig
@@ -75,10 +77,6 @@ class Simulate:
         """Of all its journeys."""
         return 0.3 * _kilometres(self.simulation, self.simulation.journeys)
 
-    def needs(self) -> Sequence[Task]:
-        """Nothing."""
-        return ()
-
     def is_done(self, folder: StudyFolder) -> bool:
         """True if the dataset is there: it is written as a whole."""
         return folder.dataset(self.simulation).exists()
@@ -89,7 +87,7 @@ class Simulate:
 
 
 @dataclass(frozen=True)
-class MapJourney:
+class MapJourney(Task):
     """The map of one journey, and what it is worth."""
 
     simulation: SimulationConfig
@@ -112,10 +110,6 @@ class MapJourney:
         """The dataset."""
         return (Simulate(self.simulation),)
 
-    def is_done(self, folder: StudyFolder) -> bool:
-        """True if it was measured, which comes last."""
-        return folder.has_result(self.key)
-
     def run(self, folder: StudyFolder) -> None:
         """Maps the journey and measures the map."""
         drives = load_drives(folder.dataset(self.simulation))
@@ -128,7 +122,7 @@ class MapJourney:
 
 
 @dataclass(frozen=True)
-class MeasureMap:
+class MeasureMap(Task):
     """What the map of some journeys of a dataset is worth."""
 
     simulation: SimulationConfig
@@ -171,10 +165,6 @@ class MeasureMap:
         """The single journeys, and the dataset should it have been removed."""
         return (Simulate(self.simulation), *self.journeys())
 
-    def is_done(self, folder: StudyFolder) -> bool:
-        """True if it was measured."""
-        return folder.has_result(self.key)
-
     def run(self, folder: StudyFolder) -> None:
         """Maps the journeys together and measures the map."""
         drives, maps = self.load(folder)
@@ -197,7 +187,7 @@ class MeasureMap:
 
 
 @dataclass(frozen=True)
-class MeasureReal:
+class MeasureReal(Task):
     """What the map of a real drive is worth, against positions that were measured."""
 
     dataset: Path
@@ -216,14 +206,6 @@ class MeasureReal:
     def cost_s(self) -> float:
         """Of a drive of a few minutes."""
         return 20.0
-
-    def needs(self) -> Sequence[Task]:
-        """Nothing."""
-        return ()
-
-    def is_done(self, folder: StudyFolder) -> bool:
-        """True if it was measured."""
-        return folder.has_result(self.key)
 
     def run(self, folder: StudyFolder) -> None:
         """Maps the drive and measures the map."""
@@ -299,7 +281,7 @@ def run_tasks(
         progress(_STAGE, round(done), max(round(total), 1), task.key)
 
     if processes <= 1:
-        _use_one_core()
+        torch.set_num_threads(1)
         for task in waiting.values():
             task.run(folder)
             tell(task)
@@ -328,10 +310,6 @@ def run_tasks(
 def _begin_worker() -> None:
     # Ctrl-C ends a worker at once; files are written beside their place and renamed.
     signal(SIGINT, SIG_DFL)
-    _use_one_core()
-
-
-def _use_one_core() -> None:
     torch.set_num_threads(1)
 
 

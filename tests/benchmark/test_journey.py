@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from drives import write_tiny
+from worlds.drives import write_tiny
 
 from crowdmap_torch.benchmark import journey as benchmark
 from crowdmap_torch.geometry import se3

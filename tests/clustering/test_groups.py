@@ -1,17 +1,21 @@
-"""Figures of groups of rows agree with a loop over the groups; pairs and votes are found."""
+"""Figures of groups of rows agree with a loop over the groups."""
 
 from __future__ import annotations
 
 import torch
 
 from crowdmap_torch.clustering.groups import (
+    cheapest,
+    distinct_pairs,
+    group_argmin,
+    group_count,
     group_median,
     group_mode,
+    group_range,
     group_sum,
     pairs_within,
+    rows_of_ranges,
 )
-from crowdmap_torch.clustering.neighbours import cross_pairs, near_pairs
-from crowdmap_torch.clustering.voting import densest
 
 
 def rows(n: int = 40, groups: int = 6) -> tuple[torch.Tensor, torch.Tensor]:
@@ -52,32 +56,56 @@ def test_pairs_within_groups_are_complete():
     assert found == wanted
 
 
-def test_near_pairs_are_those_within_the_radius():
-    point, _ = rows()
-    distance = torch.cdist(point, point)
-    wanted = torch.nonzero((distance < 1.0).triu(1))
-    assert torch.equal(near_pairs(point, radius=1.0, count=40), wanted)
-    few = near_pairs(point, radius=10.0, count=1)
-    assert len(few) < len(point)
+def test_argmin_is_the_first_of_the_least():
+    value = torch.tensor([5.0, 2.0, 2.0, 7.0, 1.0])
+    group = torch.tensor([0, 1, 1, 0, 0])
+    assert group_argmin(value, group).tolist() == [4, 1]
 
 
-def test_cross_pairs_are_those_within_the_radius():
-    point, _ = rows()
-    wanted = torch.nonzero(torch.cdist(point[:10], point[10:]) < 1.0)
-    assert torch.equal(cross_pairs(point[:10], point[10:], radius=1.0, count=30), wanted)
+def test_nan_is_least_only_where_nothing_else_is():
+    value = torch.tensor([torch.nan, 3.0, torch.nan, torch.nan])
+    assert group_argmin(value, torch.tensor([0, 0, 1, 1])).tolist() == [1, 2]
+    assert len(group_argmin(value[:0], torch.zeros(0, dtype=torch.int64))) == 0
 
 
-def test_votes_find_the_shift_most_agree_on():
-    g = torch.Generator().manual_seed(4)
-    truth = torch.tensor([[1.0, -2.0, 0.5], [0.0, 0.0, -0.7]]).double()
-    group = torch.tensor([0] * 40 + [1] * 25)
-    good = torch.arange(65) % 3 > 0
-    vote = truth[group] + 0.1 * torch.randn(65, 3, generator=g, dtype=torch.float64)
-    wrong = 6 * torch.rand(65, 3, generator=g, dtype=torch.float64) - 3
-    vote = torch.where(good[:, None], vote, wrong)
-    one = torch.ones(65).double()
-    found = densest(vote, one, 0 * one, group, groups=3, width=0.3)
-    # The mean of 16 votes with 0.1 m of noise, 4 sigma.
-    assert (found.vector[:2] - truth).abs().max() < 0.1
-    assert (found.support[:2] > 2 * found.runner_up[:2]).all()
-    assert found.support[2] == 0
+def test_range_agrees_with_a_loop():
+    value, label = rows()
+    value, label = value[label >= 0, 0], label[label >= 0]
+    least, largest = group_range(value, label, 6)
+    for c in range(6):
+        own = value[label == c]
+        assert float(least[c]) == min(own.tolist(), default=0.0)
+        assert float(largest[c]) == max(own.tolist(), default=0.0)
+
+
+def test_cheapest_partner_is_the_smaller_of_equals():
+    row = torch.tensor([0, 0, 0, 2, 2])
+    other = torch.tensor([7, 5, 6, 1, 3])
+    cost = torch.tensor([2.0, 1.0, 1.0, torch.inf, torch.inf])
+    best, partner = cheapest(row, other, cost, 3)
+    assert best.tolist() == [1.0, torch.inf, torch.inf]
+    assert partner.tolist() == [5, -1, -1]
+
+
+def test_distinct_pairs_are_sorted_and_counted():
+    first, second = torch.tensor([3, -1, 3, 0, 3]), torch.tensor([1, 2, 1, -1, 0])
+    a, b, number = distinct_pairs(first, second)
+    assert list(zip(a.tolist(), b.tolist(), number.tolist(), strict=True)) == [
+        (-1, 2, 1),
+        (0, -1, 1),
+        (3, 0, 1),
+        (3, 1, 2),
+    ]
+
+
+def test_count_leaves_the_unlabelled_out():
+    _, label = rows()
+    assert group_count(label, 6).tolist() == [int((label == c).sum()) for c in range(6)]
+
+
+def test_rows_of_ranges_are_those_of_a_loop():
+    start, size = torch.tensor([4, 0, 7, 2]), torch.tensor([2, 0, 1, 3])
+    number, row = rows_of_ranges(start, size)
+    assert number.tolist() == [0, 0, 2, 3, 3, 3] and row.tolist() == [4, 5, 7, 2, 3, 4]
+    number, row = rows_of_ranges(start[:0], size[:0])
+    assert len(number) == len(row) == 0

@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from worlds.partitions import same_partition
 
 from crowdmap_torch.clustering import spectral
 from crowdmap_torch.clustering.neighbours import near_pairs
-from crowdmap_torch.clustering.spectral import SpectralConfig, cluster_graph, same_partition
+from crowdmap_torch.clustering.spectral import SpectralConfig, cluster_graph
 
 
 def blobs(centers: Tensor, members: int, sigma: float, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -6,13 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from crowdmap_torch.evaluate import (
-    control_ids_of,
-    evaluate_map,
-    progress_scalars,
-)
+from crowdmap_torch.evaluation.evaluate import control_ids_of, evaluate_map, progress_scalars
 from crowdmap_torch.evaluation.single_journey import JourneyLandmarks
 from crowdmap_torch.evaluation.text import format_figures
+from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import SignAssociations, Truth
 from crowdmap_torch.tables import Origin
 
@@ -113,3 +110,17 @@ def test_progress_scalars_leave_out_what_is_unknown(build, simulated):
     assert scalars["error/lane_recall"] == 1
     nothing = true[torch.zeros(0, dtype=torch.int64)]
     assert "error/corner_m" not in progress_scalars(nothing, survey)
+
+
+def test_real_surveyed_centres_are_measured_by_centre(build, real_data):
+    survey = read_survey(real_data("kitti-signs/kitti-00") / "survey")
+    assert not survey.signs.has_corners.any()
+    signs = build.signs(survey.signs.center_world + torch.tensor([0.1, 0.0, 0.0]))
+    figures = evaluate_map(
+        replace(build.hd_map(signs), origin=survey.origin), survey, gate_m=2.0
+    ).as_dict()
+    assert figures["signs"]["recall"] == figures["signs"]["precision"] == 1
+    assert figures["signs"]["absolute"]["total"]["count"] == 0
+    # The shift is given in single precision.
+    assert figures["signs"]["absolute_center"]["total"]["mean"] == pytest.approx(0.1, abs=1e-6)
+    assert figures["lanes"] is None

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from crowdmap_torch.evaluation.lanes import LaneEvaluationConfig, evaluate_lanes, survey_samples
-from crowdmap_torch.evaluation.polyline import sample_lanes, sample_polylines
 
 ROUNDING_M = 1e-9
 
@@ -12,37 +11,6 @@ ROUNDING_M = 1e-9
 def arc(radius: float, *, points: int = 21, lift: float = 0.0) -> torch.Tensor:
     angle = torch.linspace(0, 1.2, points, dtype=torch.float64)
     return torch.stack((radius * angle.cos(), radius * angle.sin(), 0 * angle + lift), dim=-1)
-
-
-def test_samples_are_equally_spaced_and_include_both_ends(build):
-    line = torch.tensor([0, 0, 0, 2, 2])
-    point = torch.tensor(
-        [[0.0, 0, 0], [3, 0, 0], [3, 1.2, 0], [9, 0, 0], [9, 0, 2]], dtype=torch.float64
-    )
-    samples = sample_polylines(line, point, 0.5)
-    first, second = samples[samples.line == 0], samples[samples.line == 2]
-    assert len(first) == 10
-    assert len(second) == 5
-    assert torch.equal(first.point_world[-1], point[2])
-    assert first.point_world[6].tolist() == [3, 0, 0]
-    # Straight up has no horizontal direction.
-    assert second.along.abs().max() == 0
-
-
-def test_repeated_points_and_single_points_do_no_harm():
-    line = torch.tensor([0, 0, 0, 1])
-    point = torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [5, 5, 5]], dtype=torch.float64)
-    samples = sample_polylines(line, point, 0.5)
-    assert samples.line.tolist() == [0, 0, 0]
-    assert samples.point_world.isfinite().all()
-
-
-def test_lanes_are_sampled_whatever_the_order_of_their_control_points(build):
-    one, other = build.straight(0), build.straight(3.5, points=4)
-    lanes = build.lanes([one, other])
-    samples = sample_lanes(lanes.select(torch.tensor([1, 0])), 0.5)
-    assert samples.line.bincount().tolist() == [201, 201]
-    assert (samples.point_world[samples.line == 0, 1] - 3.5).abs().max() < ROUNDING_M
 
 
 def test_a_map_that_is_the_survey_has_no_error(build):

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from crowdmap_torch.evaluation.matching import DUPLICATE, FALSE, SignMatchConfig, match_signs
-from crowdmap_torch.evaluation.signs import evaluate_signs
+from crowdmap_torch.evaluation.signs import SignEvaluationConfig, evaluate_signs
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.survey.matching import SurveyMatchConfig
 
 ROUNDING_M = 1e-9
 """Coordinates of some hundred metres lose no more than this."""
@@ -63,23 +63,6 @@ def test_relative_error_needs_three_signs_within_150_m(build):
     assert figures.relative.total.count == 2
 
 
-def test_matching_is_repeated_without_the_shift(build):
-    post = torch.tensor([[0.0, 0, 2.0], [0.0, 0, 2.7], [40.0, 0, 2.0], [80, 0, 2], [120, 0, 2]])
-    signs = build.signs(post)
-    shifted = build.moved(signs, (0.0, 0.0, 0.7))
-    match = match_signs(shifted, build.survey_signs(signs), SignMatchConfig())
-    # 0.7 m is the distance of the two signs on the post: without the second round the lower one
-    # would be taken for the upper.
-    assert match.map_row.tolist() == match.true_row.tolist() == [0, 1, 2, 3, 4]
-
-
-def test_a_false_sign_does_not_make_neighbours_swap(build):
-    survey = build.survey_signs(build.signs([[0, 0, 2], [0, 2.8, 2], [50, 0, 2], [90, 0, 2.0]]))
-    signs = build.signs([[0, 0, 2], [0, -2.9, 2], [50, 0, 2], [90, 0, 2.0]])
-    match = match_signs(signs, survey, SignMatchConfig())
-    assert match.true_of_map.tolist() == [0, DUPLICATE, 2, 3]
-
-
 def test_duplicates_are_near_a_true_sign_and_false_ones_are_not(build, row_of_signs):
     survey = build.survey_signs(build.signs(row_of_signs))
     extra = torch.stack((row_of_signs[0] + 1.0, row_of_signs[0] + torch.tensor([0, 8, 0])))
@@ -87,18 +70,6 @@ def test_duplicates_are_near_a_true_sign_and_false_ones_are_not(build, row_of_si
     figures = evaluate_signs(signs, survey)
     assert (figures.duplicates, figures.false) == (1, 1)
     assert figures.precision == pytest.approx(12 / 14)
-    match = match_signs(signs, survey, SignMatchConfig())
-    assert match.true_of_map.tolist()[-2:] == [DUPLICATE, FALSE]
-
-
-def test_shape_and_facing_decide_between_signs_back_to_back(build):
-    center = torch.tensor([[0.0, 0, 2], [0.3, 0, 2], [50, 0, 2], [70, 0, 2]])
-    heading = torch.tensor([0.0, math.pi, 0, 0], dtype=torch.float64)
-    survey = build.survey_signs(build.signs(center, heading=heading))
-    swapped = build.signs(center[[1, 0, 2, 3]], heading=heading)
-    match = match_signs(swapped, survey, SignMatchConfig())
-    # 0.3 m of distance each, against 1.5 m each for facing away.
-    assert match.map_row.tolist() == match.true_row.tolist() == [0, 1, 2, 3]
 
 
 def test_the_gate_is_on_the_distance(build, row_of_signs):
@@ -107,8 +78,8 @@ def test_the_gate_is_on_the_distance(build, row_of_signs):
     shift[4, 1] = 2.5
     signs = build.moved(build.signs(row_of_signs), shift)
     assert evaluate_signs(signs, survey).matched == 12
-    match = match_signs(signs, survey, SignMatchConfig(gate_m=2.0))
-    assert len(match.map_row) == 11
+    near = SignEvaluationConfig(match=SurveyMatchConfig(gate_m=2.0))
+    assert evaluate_signs(signs, survey, config=near).matched == 11
 
 
 def test_signs_that_are_not_observable_count_neither_way(build, row_of_signs):

@@ -5,8 +5,8 @@ import torch
 
 from crowdmap_torch.evaluation.single_journey import (
     JourneyLandmarks,
-    closest_view,
     evaluate_single_journeys,
+    nearest_seeing_frame,
 )
 
 
@@ -53,10 +53,10 @@ def test_recall_expects_signs_of_ten_frames_only(build):
     assert figures.ghosts == 0.5
 
 
-def test_closest_view_is_the_nearest_frame_that_has_the_point_in_its_image(build):
+def test_nearest_seeing_frame_is_the_nearest_frame_that_has_the_point_in_its_image(build):
     drive = build.drive("a")
     points = torch.tensor([[50.0, 4.0, 1.5], [50.0, 0.0, 0.0], [200.0, 0.0, 1.5]]).double()
-    frame = closest_view(drive, points, 120.0)
+    frame = nearest_seeing_frame(drive, points, 120.0)
     # 640 px to the left at f = 1000: 4 m aside is in the image from 6.25 m on; the ground 1.5 m
     # below from 3.75 m on.
     assert frame.tolist() == [43, 46, 99]

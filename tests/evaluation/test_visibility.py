@@ -5,8 +5,8 @@ import torch
 
 from crowdmap_torch.evaluation.lanes import survey_samples
 from crowdmap_torch.evaluation.visibility import (
-    closest_approach,
     frames_of_signs,
+    nearest_detections,
     observable_signs,
     oracle_figures,
     seen_by_journeys,
@@ -35,10 +35,10 @@ def test_a_sign_detected_twice_in_a_frame_is_seen_in_one_frame(build):
     assert frames_of_signs(drive, 2).tolist() == [2, 0]
 
 
-def test_closest_approach_is_the_nearest_frame_with_a_detection(build):
+def test_the_nearest_detection_is_the_nearest_frame_with_a_detection(build):
     survey = build.survey_signs(build.signs([[60.0, 4, 2], [90, 4, 2]]))
     drive = build.drive("a", sign_rows=[(20, 1), (45, 0), (40, 0), (50, -1), (30, 1)])
-    sign, frame = closest_approach(drive, survey)
+    sign, frame = nearest_detections(drive, survey)
     assert sign.tolist() == [0, 1]
     assert frame.tolist() == [45, 30]
 

@@ -21,10 +21,7 @@ BROWN_CONRADY = {
     "5": (1000.0, [-0.35, 0.12, 1e-3, -5e-4, -0.02]),
     "5 pincushion": (900.0, [0.3, 0.2, 0.0, 0.0, 0.1]),
     "8 rational": (700.0, [-0.4, 0.2, 1e-3, -1e-3, 0.1, 0.2, -0.05, 0.02]),
-    "12 thin prism": (
-        800.0,
-        [-0.3, 0.1, 1e-3, -1e-3, 0.01, 0.1, 0, 0, 1e-3, -2e-3, 2e-3, 1e-3],
-    ),
+    "12 thin prism": (800.0, [-0.3, 0.1, 1e-3, -1e-3, 0.01, 0.1, 0, 0, 1e-3, -2e-3, 2e-3, 1e-3]),
     "14 tilted": (
         800.0,
         [-0.3, 0.1, 1e-3, -1e-3, 0.01, 0.1, 0, 0, 1e-3, -2e-3, 2e-3, 1e-3, 0.03, -0.02],
@@ -42,8 +39,7 @@ def make_camera(name: str) -> Camera:
     fisheye = name in KANNALA_BRANDT
     f, distortion = (KANNALA_BRANDT if fisheye else BROWN_CONRADY)[name]
     K = torch.tensor(
-        [[f, 0, WIDTH / 2 - 0.5], [0, 1.01 * f, HEIGHT / 2 - 0.5], [0, 0, 1]],
-        dtype=torch.float64,
+        [[f, 0, WIDTH / 2 - 0.5], [0, 1.01 * f, HEIGHT / 2 - 0.5], [0, 0, 1]], dtype=torch.float64
     )
     model = "kannala_brandt" if fisheye else "brown_conrady"
     return Camera(model, WIDTH, HEIGHT, K, torch.tensor(distortion, dtype=torch.float64))
@@ -172,8 +168,7 @@ def test_rays_of_85_degrees_are_never_used():
 def test_image_reaches_half_a_pixel_beyond_the_outer_centres():
     lens = make_camera("0")
     px = torch.tensor(
-        [[-0.5, -0.5], [-0.51, 0], [1279.5, 799.5], [1279.51, 0], [0, 799.51]],
-        dtype=torch.float64,
+        [[-0.5, -0.5], [-0.51, 0], [1279.5, 799.5], [1279.51, 0], [0, 799.51]], dtype=torch.float64
     )
     assert camera.inside_image(lens, px).tolist() == [True, False, True, False, False]
 

@@ -65,6 +65,20 @@ def test_log_of_half_a_turn_has_length_pi():
         assert w.abs().max().item() == pytest.approx(math.pi, abs=1e-7)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.0999, 0.1001, 1.0, 3.0])
+def test_right_jacobian_inverse_is_the_derivative_of_the_logarithm(angle, generator):
+    w = torch.nn.functional.normalize(
+        torch.randn(3, generator=generator, dtype=torch.float64), dim=0
+    )
+    w = angle * w
+
+    def moved(d):
+        return se3.so3_log(se3.so3_exp(w) @ se3.so3_exp(d))
+
+    expected = jacfwd(moved)(torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(se3.right_jacobian_inverse(w), expected, rtol=0, atol=1e-11)
+
+
 def test_inverse_undoes(generator):
     T = se3.exp(random_tangents(generator, 100, 3.0))
     identity = torch.eye(4, dtype=torch.float64).expand_as(T)

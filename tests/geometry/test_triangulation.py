@@ -8,12 +8,21 @@ import pytest
 import torch
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.geometry.triangulation import midpoint, midpoint_ragged
+from crowdmap_torch.geometry.triangulation import midpoint_ragged
 
 
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+def midpoint(origin: torch.Tensor, ray: torch.Tensor, weight: torch.Tensor | None = None):
+    """The point nearest to the rays of each row of a batch."""
+    points = math.prod(origin.shape[:-2])
+    group = torch.arange(points).repeat_interleave(origin.shape[-2])
+    weight = None if weight is None else weight.flatten()
+    point, _ = midpoint_ragged(origin.reshape(-1, 3), ray.reshape(-1, 3), group, points, weight)
+    return point.reshape(*origin.shape[:-2], 3)
 
 
 def rays_to(point: torch.Tensor, count: int, generator: torch.Generator):

@@ -11,7 +11,11 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 import yaml
+
+from crowdmap_torch.geometry import polygon, se3
+from crowdmap_torch.tables import ControlPoints, HdMap, Lanes, Origin, Signs
 
 NUMBERS = pa.list_(pa.float32())
 TYPES = {
@@ -148,7 +152,7 @@ def write_table(path: Path, content: Any) -> None:
 
 
 @pytest.fixture
-def tiny(tmp_path: Path) -> TinyDataset:
+def sound(tmp_path: Path) -> TinyDataset:
     """A sound dataset, not written yet; the rig `a` has a mount, `b` has none."""
     names = ("a", "b")
     rigs = {name: copy.deepcopy(RIG) for name in names}
@@ -163,4 +167,60 @@ def tiny(tmp_path: Path) -> TinyDataset:
         rigs=rigs,
         urdfs={"a": URDF},
         journeys={name: TinyJourney(heads[name]) for name in names},
+    )
+
+
+@pytest.fixture
+def hd_map(generator) -> HdMap:
+    """One sign of every shape, upright within a few degrees, and two lane pieces."""
+    n = len(polygon.SHAPES)
+    # Faces west: x to the north's right hand (south), y up, z to the west.
+    R = torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+    tilt = 0.05 * torch.randn(n, 3, dtype=torch.float64, generator=generator)
+    p = 50 * torch.randn(n, 3, dtype=torch.float64, generator=generator)
+    A = torch.randn(n, 3, 3, dtype=torch.float64, generator=generator)
+    support = torch.arange(n)
+    none = torch.full((n,), -1)
+    confidence = torch.full((n,), 0.7, dtype=torch.float64)
+    confidence[:5] = torch.tensor([0.9, 0.4, 1.0, 0.5, 0.0])
+    signs = Signs(
+        shape=support,
+        type=torch.tensor([0, -1, 1]).repeat(n)[:n],
+        T_world_sign=se3.make(R @ se3.so3_exp(tilt), p),
+        size=0.5 + torch.rand(n, 2, dtype=torch.float64, generator=generator),
+        covariance=A @ A.mT,
+        journey=none,
+        tracklet=none,
+        frame=none,
+        n_journeys=support + 3,
+        n_observations=support + 30,
+        first_seen_ns=support + 10**18,
+        last_seen_ns=support + 2 * 10**18,
+        confidence=confidence,
+    )
+    station = torch.linspace(0, 1, 7, dtype=torch.float64)[:, None]
+    curve = torch.cat((30 * station, 4 * station.square(), 0.3 * station), dim=-1)
+    lanes = Lanes(
+        type=torch.tensor([1, -1]),
+        control_start=torch.tensor([2, 0]),
+        control_count=torch.tensor([5, 2]),
+        journey=none[:2],
+        tracklet=none[:2],
+        frame=none[:2],
+        n_journeys=torch.tensor([3, 4]),
+        n_observations=torch.tensor([300, 400]),
+        first_seen_ns=torch.tensor([1, 2]),
+        last_seen_ns=torch.tensor([3, 4]),
+        confidence=torch.tensor([0.9, 0.8], dtype=torch.float64),
+        control=ControlPoints(point_world=curve, sigma=0.01 + station[:, 0]),
+    )
+    return HdMap(
+        origin=Origin(32.9, -117.2, 120.0),
+        signs=signs,
+        lanes=lanes,
+        sign_id=tuple(f"s{k}" for k in range(n)),
+        lane_id=("l0", "l1"),
+        type_names=("DE:274", "US:R1-1"),
+        shared_covariance=0.1 * torch.eye(3, dtype=torch.float64),
+        provenance={"version": "0.1.0", "journeys": ["a", "b"]},
     )

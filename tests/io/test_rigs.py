@@ -12,12 +12,12 @@ from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.rigs import read_rig
 
 
-def read(tiny, name: str = "a"):
-    return read_rig(tiny.write() / "rigs" / name)
+def read(sound, name: str = "a"):
+    return read_rig(sound.write() / "rigs" / name)
 
 
-def test_a_rig_is_read_as_it_stands(tiny) -> None:
-    rig = read(tiny)
+def test_a_rig_is_read_as_it_stands(sound) -> None:
+    rig = read(sound)
     assert rig.rig_id == "a"
     assert rig.camera.K.tolist() == [[100, 0, 59.5], [0, 100, 39.5], [0, 0, 1]]
     assert (rig.camera.width, rig.camera.height) == (120, 80)
@@ -28,27 +28,27 @@ def test_a_rig_is_read_as_it_stands(tiny) -> None:
     torch.testing.assert_close(z_link, torch.tensor([1.0, 0, 0], dtype=torch.float64))
 
 
-def test_without_a_mount_the_poses_are_the_cameras_own(tiny) -> None:
-    assert torch.equal(read(tiny, "b").T_link_camera, torch.eye(4, dtype=torch.float64))
+def test_without_a_mount_the_poses_are_the_cameras_own(sound) -> None:
+    assert torch.equal(read(sound, "b").T_link_camera, torch.eye(4, dtype=torch.float64))
 
 
 @pytest.mark.parametrize(
     ("model", "count"),
     [("brown_conrady", n) for n in (0, 4, 5, 8, 12, 14)] + [("kannala_brandt", 4)],
 )
-def test_every_number_of_coefficients_of_the_format_is_read(tiny, model, count) -> None:
-    tiny.rigs["b"]["camera"] |= {"model": model, "distortion": [1e-5] * count}
-    assert read(tiny, "b").camera.distortion.tolist() == [1e-5] * count
+def test_every_number_of_coefficients_of_the_format_is_read(sound, model, count) -> None:
+    sound.rigs["b"]["camera"] |= {"model": model, "distortion": [1e-5] * count}
+    assert read(sound, "b").camera.distortion.tolist() == [1e-5] * count
 
 
-def test_numbers_as_python_writes_them_are_numbers(tiny) -> None:
+def test_numbers_as_python_writes_them_are_numbers(sound) -> None:
     # YAML 1.1 takes 1e-05 for a text.
-    text = yaml.safe_dump(tiny.rigs["b"]).replace(
+    text = yaml.safe_dump(sound.rigs["b"]).replace(
         "distortion: []", "distortion: [1e-05, 0, -2E-6, 0]"
     )
     assert "1e-05" in text
-    tiny.rigs["b"] = text
-    assert read(tiny, "b").camera.distortion.tolist() == [1e-5, 0, -2e-6, 0]
+    sound.rigs["b"] = text
+    assert read(sound, "b").camera.distortion.tolist() == [1e-5, 0, -2e-6, 0]
 
 
 def camera(**changes: object):
@@ -131,26 +131,26 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_of_a_rig_is_one_line(tiny, fault) -> None:
+def test_a_fault_of_a_rig_is_one_line(sound, fault) -> None:
     spoil, reason = FAULTS[fault]
-    spoil(tiny)
-    folder = tiny.write() / "rigs" / "a"
+    spoil(sound)
+    folder = sound.write() / "rigs" / "a"
     folder.mkdir(parents=True, exist_ok=True)
     with pytest.raises(InputError, match=reason) as error:
         read_rig(folder)
     assert "\n" not in str(error.value)
 
 
-def test_a_link_out_of_the_rigs_folder_is_not_followed(tiny) -> None:
-    tiny.urdfs["b"] = tiny.urdfs.pop("a")
-    folder = tiny.write() / "rigs" / "a"
+def test_a_link_out_of_the_rigs_folder_is_not_followed(sound) -> None:
+    sound.urdfs["b"] = sound.urdfs.pop("a")
+    folder = sound.write() / "rigs" / "a"
     (folder / "rig.urdf").symlink_to(folder.parent / "b" / "rig.urdf")
     with pytest.raises(InputError, match="expected a file inside the rig's folder"):
         read_rig(folder)
 
 
-def test_a_rig_that_is_not_text_is_refused(tiny) -> None:
-    folder = tiny.write() / "rigs" / "a"
+def test_a_rig_that_is_not_text_is_refused(sound) -> None:
+    folder = sound.write() / "rigs" / "a"
     (folder / "rig.yaml").write_bytes(b"camera: \xff\xfe")
     with pytest.raises(InputError, match=r"rig\.yaml: cannot be read as YAML"):
         read_rig(folder)

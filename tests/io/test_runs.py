@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import math
 from pathlib import Path
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
 
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.poses import read_poses
-from crowdmap_torch.io.runs import (
-    write_associations,
-    write_metrics,
-    write_refined_poses,
-    write_road,
-)
+from crowdmap_torch.io.runs import write_associations, write_refined_poses, write_road_estimate
 from crowdmap_torch.tables import RoadEstimate
 
 
 @pytest.mark.parametrize("sigmas", [False, True])
-def test_poses_that_were_not_refined_come_back_with_the_same_columns(tiny, sigmas) -> None:
+def test_poses_that_were_not_refined_come_back_with_the_same_columns(sound, sigmas) -> None:
     if sigmas:
-        tiny.journeys["a"].poses |= {f"sigma_{k}": [0.3] * 4 for k in ("e", "n", "u", "rot")}
-    folder = tiny.write()
+        sound.journeys["a"].poses |= {f"sigma_{k}": [0.3] * 4 for k in ("e", "n", "u", "rot")}
+    folder = sound.write()
     source = folder / "journeys" / "a" / "poses.parquet"
     journey = load_dataset(folder).journeys[0]
     write_refined_poses(folder / "out.parquet", journey, journey.T_world_camera)
@@ -42,8 +34,8 @@ def test_poses_that_were_not_refined_come_back_with_the_same_columns(tiny, sigma
     torch.testing.assert_close(T_after, T_before, atol=1e-14, rtol=0)
 
 
-def test_refined_poses_and_sigmas_are_written(tiny) -> None:
-    folder = tiny.write()
+def test_refined_poses_and_sigmas_are_written(sound) -> None:
+    folder = sound.write()
     journey = load_dataset(folder).journeys[1]
     T = journey.T_world_camera.clone()
     T[:, 0, 3] += 0.25
@@ -55,11 +47,11 @@ def test_refined_poses_and_sigmas_are_written(tiny) -> None:
     assert torch.equal(again.sigma_position, sigma)
 
 
-def test_every_row_of_the_detection_files_has_an_association(tiny) -> None:
+def test_every_row_of_the_detection_files_has_an_association(sound) -> None:
     # Anticlockwise: dropped at the door, and still a row of the file.
-    tiny.journeys["b"].signs["u"][0] = [30.0, 30.0, 50.0, 50.0]
-    tiny.journeys["b"].signs["v"][0] = [20.0, 30.0, 30.0, 20.0]
-    folder = tiny.write()
+    sound.journeys["b"].signs["u"][0] = [30.0, 30.0, 50.0, 50.0]
+    sound.journeys["b"].signs["v"][0] = [20.0, 30.0, 30.0, 20.0]
+    folder = sound.write()
     journeys = load_dataset(folder).journeys
     write_associations(
         folder / "associations.parquet",
@@ -105,26 +97,8 @@ def test_the_road_is_written_frame_by_frame(tmp_path: Path) -> None:
         height=torch.tensor([1.4, 1.5], dtype=torch.float64),
         sigma=torch.tensor([0.01, 0.02], dtype=torch.float64),
     )
-    write_road(tmp_path / "road.parquet", torch.tensor([3, 5]), road)
+    write_road_estimate(tmp_path / "road.parquet", torch.tensor([3, 5]), road)
     assert pq.read_table(tmp_path / "road.parquet").to_pylist() == [
         {"frame": 3, "nx": 0.0, "ny": 1.0, "nz": 0.0, "height_m": 1.4, "sigma": 0.01},
         {"frame": 5, "nx": 0.6, "ny": 0.8, "nz": 0.0, "height_m": 1.5, "sigma": 0.02},
     ]
-
-
-def test_metrics_hold_plain_json(tmp_path: Path) -> None:
-    metrics = {
-        "tensor": torch.tensor([1.0, math.nan]),
-        "array": np.array([[1, 2]]),
-        "scalar": np.float64(0.5),
-        "nested": {"tuple": (1, "two", None, True), "infinite": math.inf},
-        "path": Path("map"),
-    }
-    write_metrics(tmp_path / "metrics.json", metrics)
-    assert json.loads((tmp_path / "metrics.json").read_text()) == {
-        "tensor": [1.0, None],
-        "array": [[1, 2]],
-        "scalar": 0.5,
-        "nested": {"tuple": [1, "two", None, True], "infinite": None},
-        "path": "map",
-    }

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from crowdmap_torch.optim.linear import DenseBackend
 from crowdmap_torch.optim.linearize import chunks, term_costs
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
 from crowdmap_torch.optim.robust import JointTukey, Tukey
+from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 ROW_DIM = 2
 C = 4.685

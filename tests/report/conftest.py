@@ -2,23 +2,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from small_world import Builder
+from worlds.small_world import Builder
 
-from crowdmap_torch.evaluate import evaluate_map
-from crowdmap_torch.report.record import (
-    Iteration,
-    JourneySummary,
-    Pruned,
-    RunRecord,
-    Spectrum,
-)
+from crowdmap_torch.evaluation.evaluate import evaluate_map
+from crowdmap_torch.report.iteration import Iteration
+from crowdmap_torch.report.plots import Eigengap
+from crowdmap_torch.report.record import RunRecord
+from crowdmap_torch.report.summaries import JourneySummary, Pruned
 from crowdmap_torch.tables import RejectedJourney
-
-
-@pytest.fixture(scope="session")
-def build() -> Builder:
-    """What makes tables from a few numbers."""
-    return Builder()
 
 
 @pytest.fixture(scope="session")
@@ -75,8 +66,8 @@ def record(build: Builder) -> RunRecord:
         counts={"sign detections": 90, "eigenvalue gap": 0.61, "method": "ours"},
         pruned=(Pruned("signs", "too little parallax", 3), Pruned("signs", "too short", 12)),
         rejected=(RejectedJourney("c", "poses.parquet: row 3: x is NaN"),),
-        suspects=(RejectedJourney("d", "its bias of 9.8 m does not fit the others"),),
-        spectra=(Spectrum("signs, round 2", (0.0, 0.01, 0.02, 0.7, 0.8), 3),),
+        outlier_journeys=(RejectedJourney("d", "its bias of 9.8 m does not fit the others"),),
+        spectra=(Eigengap("signs, round 2", (0.0, 0.01, 0.02, 0.7, 0.8), 3),),
         residual_px={"triangulated": torch.rand(200, generator=generator) + 0.1},
         iterations=iterations,
         outcome="converged: the cost no longer falls",

@@ -7,9 +7,16 @@ import pytest
 import torch
 from matplotlib._pylab_helpers import Gcf
 
+from crowdmap_torch.evaluation.evaluate import evaluate_map
 from crowdmap_torch.evaluation.signs import compare_signs
+from crowdmap_torch.io.truth import Truth
+from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.report import plots
-from crowdmap_torch.report.record import Iteration, JourneySummary, RunRecord, Spectrum
+from crowdmap_torch.report.iteration import Iteration
+from crowdmap_torch.report.plots import Eigengap, sign_errors
+from crowdmap_torch.report.record import RunRecord
+from crowdmap_torch.report.summaries import JourneySummary
+from crowdmap_torch.tables import Survey
 
 
 def every_plot(record: RunRecord):
@@ -18,7 +25,7 @@ def every_plot(record: RunRecord):
         plots.plot_map(record.hd_map, record.survey),
         plots.plot_sign_errors(record.comparison, record.comparison_before, oracle_m=0.1),
         plots.plot_bias(record.journeys),
-        plots.plot_spectrum(record.spectra),
+        plots.plot_eigengaps(record.spectra),
         plots.plot_residuals(record.residual_px),
         plots.plot_convergence(record.iterations),
     ]
@@ -47,7 +54,7 @@ def test_nothing_to_draw_is_drawn(build, record, residual):
         plots.plot_map(nothing),
         plots.plot_residuals({"a": residual}),
         plots.plot_convergence([Iteration(0, {"a": 0.0}, 1.0, 0.0, 0.0)]),
-        plots.plot_spectrum([Spectrum("one", (0.0,), 1), Spectrum("none", (), 0)]),
+        plots.plot_eigengaps([Eigengap("one", (0.0,), 1), Eigengap("none", (), 0)]),
         plots.plot_bias([JourneySummary("a", 0, 0, 0, 0, (0.0, 0.0, 0.0))]),
     ]
     for figure in figures:
@@ -64,3 +71,15 @@ def test_errors_are_of_centres_where_no_corners_were_surveyed(build):
     )
     assert plots.sign_errors(comparison, "absolute").tolist() == pytest.approx([0.3] * 3)
     assert plots.sign_errors(comparison, "relative").max() < 1e-9
+
+
+def test_the_report_shows_the_signs_that_the_figures_count(
+    tiny_result: MapResult, tiny_survey: Survey, tiny_truth: Truth
+):
+    control = tiny_survey.sign_id[:2]
+    figures = evaluate_map(tiny_result.hd_map, tiny_survey, truth=tiny_truth, control_ids=control)
+    assert figures.comparison is not None
+    assert "comparison" not in figures.as_dict()
+    errors = sign_errors(figures.comparison, "absolute")
+    assert len(errors) == figures.signs.matched_observable < len(tiny_survey.sign_id)
+    assert float(errors.mean()) == pytest.approx(figures.signs.absolute.total.mean, rel=0.1)

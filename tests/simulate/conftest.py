@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from crowdmap_torch.simulate import WORLD_PRESETS, SimulationConfig, World, make_fleet, make_world
+from crowdmap_torch.simulate.dataset import SimulationConfig, make_fleet, make_world
 from crowdmap_torch.simulate.rigs import SimulatedRig
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, World
 
 
 @pytest.fixture(scope="session")

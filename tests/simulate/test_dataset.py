@@ -13,9 +13,10 @@ from crowdmap_torch.geometry.camera import project
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import read_truth
-from crowdmap_torch.simulate import WORLD_PRESETS, SimulationConfig, write_dataset
+from crowdmap_torch.simulate.dataset import SimulationConfig, write_dataset
 from crowdmap_torch.simulate.rigs import RigConfig
 from crowdmap_torch.simulate.sign_detections import DAY, corner_sigma
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS
 
 STREET = replace(WORLD_PRESETS["street"], length_m=120.0)
 SMALL = SimulationConfig(world=STREET, journeys=3, rig=RigConfig(rigs=3), seed=4)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from crowdmap_torch.simulate import make_journey
+from crowdmap_torch.simulate.dataset import make_journey
 from crowdmap_torch.simulate.faults import KINDS, POSE_FAULTS, SENSOR_FAULTS, spread_faults
 
 

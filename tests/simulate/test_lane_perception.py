@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from crowdmap_torch.geometry.camera import project
-from crowdmap_torch.simulate import WORLD_PRESETS
 from crowdmap_torch.simulate.lane_perception import DAY, detect_lanes
 from crowdmap_torch.simulate.rigs import RigConfig, build_rig
 from crowdmap_torch.simulate.vehicle import VehicleConfig, drive_through
-from crowdmap_torch.simulate.worlds import build_world
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, build_world
 
 PERFECT = replace(
     DAY,

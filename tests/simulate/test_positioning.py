@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from crowdmap_torch.simulate.positioning import (
-    PRESETS,
+    POSITIONING_PRESETS,
     PositioningConfig,
     measured_poses,
     pose_errors,
     reported_sigmas,
 )
 
-PAPER = PRESETS["paper"]
+PAPER = POSITIONING_PRESETS["paper"]
 
 
 def _errors(config: PositioningConfig, draws: int, distance: np.ndarray):
@@ -26,7 +26,9 @@ def test_paper_and_consumer_presets_have_the_numbers_of_the_specification():
     assert (PAPER.drift_rot_deg, PAPER.drift_rot_length_m) == (0.15, 100.0)
     assert 0.01 <= PAPER.white_e_m <= 0.02 and 0.01 <= PAPER.white_u_m <= 0.02
     assert PAPER.white_rot_deg == 0.02
-    assert PRESETS["consumer"] == replace(PAPER, bias_e_m=0.85, bias_n_m=0.85, bias_u_m=1.2)
+    assert POSITIONING_PRESETS["consumer"] == replace(
+        PAPER, bias_e_m=0.85, bias_n_m=0.85, bias_u_m=1.2
+    )
 
 
 def test_errors_have_the_stated_sigmas_wherever_one_looks():

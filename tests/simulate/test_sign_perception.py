@@ -8,11 +8,12 @@ import torch
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.geometry.camera import project
-from crowdmap_torch.simulate import DETECTION_PRESETS, WORLD_PRESETS, SimulationConfig
+from crowdmap_torch.simulate.dataset import DETECTION_PRESETS, SimulationConfig
 from crowdmap_torch.simulate.rigs import RigConfig, build_rig
 from crowdmap_torch.simulate.sign_detections import DAY, corner_sigma
 from crowdmap_torch.simulate.sign_perception import detect_signs
 from crowdmap_torch.simulate.vehicle import VehicleConfig, drive_through
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS
 
 PERFECT = replace(
     DAY,

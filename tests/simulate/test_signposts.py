@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from crowdmap_torch.geometry import polygon
-from crowdmap_torch.simulate import WORLD_PRESETS
-from crowdmap_torch.simulate.worlds import build_world
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, build_world
 
 
 def _signs(name: str, seed: int = 0, **changes):

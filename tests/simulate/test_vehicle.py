@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from crowdmap_torch.simulate import WORLD_PRESETS
 from crowdmap_torch.simulate.rigs import RigConfig, build_rig
 from crowdmap_torch.simulate.vehicle import VehicleConfig, drive_through
-from crowdmap_torch.simulate.worlds import build_world
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, build_world
 
 RIG = build_rig(RigConfig(), 1, np.random.default_rng(0))
 

@@ -3,7 +3,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from crowdmap_torch.studies.fleet import curve, in_turns, our_maps, paper_heads
+from crowdmap_torch.studies.fleet import (
+    curve,
+    in_short_turns,
+    in_turns,
+    our_maps,
+    paper_heads,
+    short_maps,
+)
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.scale import FULL
 
@@ -47,3 +54,13 @@ def test_the_papers_heads_have_no_lanes_and_the_same_signs():
     ours, theirs = our_maps(SCALE, 10)[1].simulation, paper_heads(SCALE, 10)[1].simulation
     assert theirs.lanes.max_lanes == 0
     assert replace(theirs, lanes=ours.lanes) == ours
+
+
+def test_seeds_of_the_short_road_come_in_turn_whatever_the_variant():
+    worse = short_maps(SCALE, change=lambda drives: replace(drives, bad_drives=("jump",)))
+    assert all(task.simulation.bad_drives == ("jump",) for task in worse)
+    turns = [
+        (task.simulation.seed, turn) for turn, task in in_short_turns(2, [short_maps(SCALE), worse])
+    ]
+    assert turns[: len(worse)] == turns[len(worse) :]
+    assert [turn for _, turn in sorted(turns[: len(worse)])] == [2, 6, 10]

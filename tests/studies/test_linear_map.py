@@ -14,7 +14,7 @@ from crowdmap_torch.evaluation.visibility import observable_signs
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult
-from crowdmap_torch.simulate import SimulationConfig
+from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.studies import linear_map as module
 from crowdmap_torch.studies.linear_map import LinearMap, linear_map

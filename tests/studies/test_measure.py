@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from nested import flat
+from worlds.nested import flat
 
 from crowdmap_torch.config import MapperConfig
-from crowdmap_torch.evaluate import evaluate_map
+from crowdmap_torch.evaluation.evaluate import evaluate_map
+from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.truth import Truth
-from crowdmap_torch.mapper import MapResult, certain_part
+from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.studies.measure import (
     Drives,
@@ -42,7 +43,7 @@ def test_the_measured_map_is_that_of_the_mapper(
             # Sums in another order differ in the last bits.
             assert flat(measured[name][part]) == pytest.approx(flat(expected[part]), rel=1e-6)
     assert measured["map"]["association"]["data_loss"] is not None
-    assert measured["suspects"] == [] and measured["bad"] == {}
+    assert measured["outlier_journeys"] == [] and measured["bad"] == {}
     assert measured["clusters"]["signs"] == sum(len(m.signs) for m in tiny_result.journey_maps)
     assert measured["seconds"]["adjusted"] > 0
 

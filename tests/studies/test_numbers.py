@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from crowdmap_torch.studies.journeys import statistical_bound
-from crowdmap_torch.studies.numbers import number, pooled_std, seconds, spread
+from crowdmap_torch.studies.numbers import number, pooled_std, seconds, spread, spreads
 
 
 def errors(values: np.ndarray) -> dict:
@@ -35,12 +34,12 @@ def test_the_pooled_spread_is_that_of_all_signs_together():
     assert math.isnan(pooled_std([{}], "map.error"))
 
 
-def test_the_statistical_bound_falls_with_the_root_down_to_what_all_share():
-    alone = [{"signs": {"absolute": {"total": {"mean": value}}}} for value in (0.4, 0.6)]
-    bound = [statistical_bound(alone, "absolute.total", n, 0.0) for n in (1, 4, 25)]
-    assert bound == pytest.approx([0.5, 0.25, 0.1])
-    assert statistical_bound(alone, "absolute.total", 10**8, 0.17) == pytest.approx(0.17, abs=1e-6)
-
-
 def test_seconds_are_those_of_all_stages():
     assert seconds([{"seconds": 1.5}, {"seconds": {"heads": 1.0, "adjusted": 2.0}}]) == 4.5
+
+
+def test_spreads_have_their_titles_and_bars_are_mean_and_sigma():
+    found = [{"a": {"b": value}} for value in (1.0, 3.0)]
+    row = spreads(found, {"title": "a.b", "missing": "a.c"})
+    assert row["title"].bar == (2.0, 1.0)
+    assert row["missing"].count == 0

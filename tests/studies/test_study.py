@@ -1,9 +1,8 @@
-"""The whole of `study.py all --quick`, once: every study runs, draws, and finds its work done the second time."""
+"""The whole of `crowdmap study all --quick`, once: every study runs, draws, and finds its work done the second time."""
 
 from __future__ import annotations
 
 import csv
-import runpy
 from collections.abc import Callable
 from dataclasses import dataclass
 from html.parser import HTMLParser
@@ -11,19 +10,17 @@ from pathlib import Path
 
 import pytest
 
+from crowdmap_torch.cli import main
 from crowdmap_torch.studies import all as every
 from crowdmap_torch.studies.scale import QUICK
 from crowdmap_torch.studies.study import Settings
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "study.py"
 DRAWN = {study.name for study in every.STUDIES} - {"real"}
-
-Main = Callable[[list[str]], int]
 
 
 @dataclass(frozen=True)
 class Quick:
-    """What `study.py all --quick` left."""
+    """What `crowdmap study all --quick` left."""
 
     out: Path
     code: int
@@ -33,7 +30,7 @@ class Quick:
         return self.out / "quick"
 
     def arguments(self, name: str = "all") -> list[str]:
-        return [name, "--quick", "--out", str(self.out), "--processes", "1"]
+        return ["study", name, "--quick", "--out", str(self.out), "--processes", "1"]
 
 
 class Sections(HTMLParser):
@@ -53,12 +50,7 @@ class Sections(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def main() -> Main:
-    return runpy.run_path(str(SCRIPT))["main"]
-
-
-@pytest.fixture(scope="module")
-def quick(main: Main, tmp_path_factory: pytest.TempPathFactory) -> Quick:
+def quick(tmp_path_factory: pytest.TempPathFactory) -> Quick:
     """The quick form, run once for all tests: under a minute of one core."""
     out = tmp_path_factory.mktemp("study")
     asked = Quick(out, -1)
@@ -101,7 +93,7 @@ def test_our_map_of_the_quick_street_is_near_the_oracle(quick: Quick):
     assert float(mean["sign recall"]) == 1
 
 
-def test_what_is_done_is_not_done_again(quick: Quick, main: Main, capsys: pytest.CaptureFixture):
+def test_what_is_done_is_not_done_again(quick: Quick, capsys: pytest.CaptureFixture):
     results = sorted((quick.folder / "results").iterdir())
     before = [path.stat().st_mtime_ns for path in results]
     assert main(quick.arguments("control")) == 0
@@ -109,7 +101,7 @@ def test_what_is_done_is_not_done_again(quick: Quick, main: Main, capsys: pytest
     assert "not done yet" not in capsys.readouterr().out
 
 
-def test_a_lost_result_alone_is_made_again(quick: Quick, main: Main):
+def test_a_lost_result_alone_is_made_again(quick: Quick):
     lost = _a_map(quick)
     before = {p.name: p.stat().st_mtime_ns for p in (quick.folder / "results").iterdir()}
     lost.unlink()
@@ -120,37 +112,35 @@ def test_a_lost_result_alone_is_made_again(quick: Quick, main: Main):
 
 
 def test_the_report_of_a_study_that_has_not_begun_is_empty_but_there(
-    main: Main, tmp_path: Path, capsys: pytest.CaptureFixture
+    tmp_path: Path, capsys: pytest.CaptureFixture
 ):
-    assert main(["all", "--quick", "--out", str(tmp_path), "--report-only"]) == 0
+    assert main(["study", "all", "--quick", "--out", str(tmp_path), "--report-only"]) == 0
     said = capsys.readouterr().out
     assert (tmp_path / "quick" / "all.html").exists()
     assert "not done yet" in said
 
 
-def test_a_folder_without_real_drives_is_wrong_input(
-    main: Main, tmp_path: Path, capsys: pytest.CaptureFixture
-):
+def test_a_folder_without_real_drives_is_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixture):
     out = tmp_path / "out"
-    code = main(["real", "--quick", "--out", str(out), "--real", str(tmp_path)])
+    code = main(["study", "real", "--quick", "--out", str(out), "--real", str(tmp_path)])
     assert code == 2
     error = capsys.readouterr().err
-    assert error.startswith("study.py: ") and error.count("\n") == 1
+    assert error.startswith("crowdmap study real: ") and error.count("\n") == 1
 
 
-def test_real_drives_are_skipped_with_a_reason(main: Main, tmp_path: Path):
-    assert main(["real", "--quick", "--out", str(tmp_path), "--processes", "1"]) == 0
+def test_real_drives_are_skipped_with_a_reason(tmp_path: Path):
+    assert main(["study", "real", "--quick", "--out", str(tmp_path), "--processes", "1"]) == 0
     assert "--real DIR" in (tmp_path / "quick" / "real.html").read_text(encoding="utf-8")
 
 
-def test_real_drives_make_a_table(main: Main, tmp_path: Path, real_data: Callable[[str], Path]):
+def test_real_drives_make_a_table(tmp_path: Path, real_data: Callable[[str], Path]):
     kitti = real_data("kitti-signs")
     chosen = tmp_path / "drives"
     chosen.mkdir()
     (chosen / "kitti-06").symlink_to(kitti / "kitti-06")
     (chosen / "eligible.json").symlink_to(kitti / "eligible.json")
     arguments = ["--quick", "--out", str(tmp_path / "out"), "--processes", "1"]
-    assert main(["real", *arguments, "--real", str(chosen)]) == 0
+    assert main(["study", "real", *arguments, "--real", str(chosen)]) == 0
     with (tmp_path / "out" / "quick" / "tables" / "real.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     ours = next(row for row in rows if row["method"] == "ours")

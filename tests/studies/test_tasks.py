@@ -1,16 +1,15 @@
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
-from nested import flat
+from worlds.nested import flat
 
 from crowdmap_torch.config import MapperConfig
-from crowdmap_torch.simulate import SimulationConfig
+from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.scale import QUICK
 from crowdmap_torch.studies.tasks import (
@@ -46,11 +45,6 @@ class Note:
         if self.fails:
             raise KeyboardInterrupt
         folder.write_result(self.key, {})
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> StudyFolder:
-    return StudyFolder(tmp_path)
 
 
 def test_needs_come_first_and_nothing_comes_twice(folder: StudyFolder):
@@ -107,19 +101,3 @@ def test_keys_follow_what_decides_the_content():
     assert Simulate(TINY).key != Simulate(other_seed).key
     assert Simulate(TINY).key != Simulate(replace(TINY, bad_drives=("jump",))).key
     assert Simulate(SimulationConfig()).key.startswith("suburb-0-")
-
-
-def test_a_result_is_there_as_a_whole_or_not_at_all(folder: StudyFolder):
-    with pytest.raises(ValueError):
-        folder.write_result("broken", {"unknown": float("nan")})
-    assert not folder.has_result("broken")
-    folder.write_result("whole", {"error": 0.5})
-    assert folder.read_result("whole") == {"error": 0.5}
-    assert [p.name for p in (folder.path / "results").iterdir()] == ["whole.json"]
-    assert json.loads((folder.path / "results" / "whole.json").read_text()) == {"error": 0.5}
-
-
-def test_a_file_is_no_study_folder(tmp_path: Path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="is a file"):
-        StudyFolder(tmp_path / "file")

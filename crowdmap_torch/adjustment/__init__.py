@@ -1,0 +1,1 @@
+"""Bundle adjustment of everything at once (V-B)."""

@@ -1,0 +1,317 @@
+"""V-B: bundle adjustment of camera poses, signs and lanes of all journeys (eq:ba).
+
+`build` makes a `Bundle` from journeys, a first map and the associations. `start` matches its lanes and finds its scales, the
+loop over `steps` adjusts it, and `adjust` is both for those who watch nothing on the way. `read_map` and `read_poses`
+give the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from crowdmap_torch.adjustment.bundle import AdjustConfig, Bundle, Observations, Priors, Unknowns
+from crowdmap_torch.adjustment.covariance import MapUncertainty
+from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes
+from crowdmap_torch.adjustment.observations import (
+    CornerObservations,
+    corner_observations,
+    frame_offsets,
+    lane_point_observations,
+    spaced_frames,
+)
+from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
+from crowdmap_torch.geometry.trajectory import station
+from crowdmap_torch.noise.pose_prior import DriftNodes, drift_nodes, pose_prior
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.optim.solvers.normal_equations import MapBackend
+from crowdmap_torch.residuals.lane import (
+    lane_prior,
+    lane_prior_jacobian,
+    lane_stretch,
+    lane_stretch_jacobian,
+)
+from crowdmap_torch.residuals.sign_prior import against_the_drive, habit_term, sign_place
+from crowdmap_torch.survey.control import ControlSigns
+from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Signs
+
+
+def build(
+    journeys: Sequence[Journey],
+    roads: Sequence[RoadEstimate],
+    signs: Signs,
+    lanes: Lanes,
+    associations: Sequence[Association],
+    drifts: Sequence[Float[Tensor, "_ 6"]],
+    positioning: PositioningNoise,
+    config: AdjustConfig,
+    *,
+    left_out: Collection[int] = (),
+    control: ControlSigns | None = None,
+) -> Bundle:
+    """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
+
+    `drifts` are tangents per frame, from the positioning module's pose to the start pose. Journeys `left_out`, by
+    number, have no say. Signs that are `control` points are held where they were surveyed.
+    """
+    given = torch.cat([journey.T_world_camera for journey in journeys])
+    drift = torch.cat(list(drifts))
+    start = se3.retract(given, drift)
+    trusted = _trusted_frames(journeys, left_out)
+    observed = _observations(journeys, roads, signs, lanes, associations, start, config)
+    every = torch.arange(len(given), device=given.device)
+    observed = observed.renumbered(torch.where(trusted, every, -1))
+    kept = _kept_frames(journeys, observed, config)
+    observed = observed.renumbered(torch.where(kept, kept.cumsum(0) - 1, -1))
+    frame = torch.nonzero(kept)[:, 0]
+    nodes = _nodes(journeys, frame, config)
+    at_nodes = drift[frame][nodes.first]
+    values = {
+        "pose": start[frame],
+        "drift": at_nodes,
+        "bias": nodes.mean(at_nodes, len(journeys)),
+        "sign": signs.T_world_sign,
+        "size": signs.size,
+        "lane": spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count),
+    }
+    poses = pose_prior(
+        journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior
+    )
+    fixed = _fixed_terms(values, signs, lanes, observed.corners, control, config)
+    priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]))
+    return Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
+
+
+def _trusted_frames(journeys: Sequence[Journey], left_out: Collection[int]) -> Bool[Tensor, " f"]:
+    """False for the frames of journeys that have no say."""
+    return torch.cat(
+        [
+            torch.full_like(journey.t_ns, number not in left_out, dtype=torch.bool)
+            for number, journey in enumerate(journeys)
+        ]
+    )
+
+
+def _kept_frames(
+    journeys: Sequence[Journey], observed: Observations, config: AdjustConfig
+) -> Bool[Tensor, " f"]:
+    """The frames with observations, thinned where a car stands."""
+    offsets = frame_offsets(journeys)
+    used = torch.zeros(offsets[-1], dtype=torch.bool, device=observed.corners.frame.device)
+    used[observed.corners.frame] = True
+    used[observed.lane_points.frame] = True
+    return torch.cat(
+        [
+            spaced_frames(journey, used[a:b], config.frame_spacing_m)
+            for journey, a, b in zip(journeys, offsets, offsets[1:], strict=False)
+        ]
+    )
+
+
+def _nodes(
+    journeys: Sequence[Journey], frame: Int[Tensor, " p"], config: AdjustConfig
+) -> DriftNodes:
+    """The stretches of road of the frames, over which the drift stands still."""
+    ends = torch.tensor(frame_offsets(journeys)[1:], device=frame.device)
+    way = torch.cat([station(journey.T_world_camera) for journey in journeys])[frame]
+    return drift_nodes(torch.searchsorted(ends, frame, right=True), way, config.drift_spacing_m)
+
+
+def _nearest_poses(pose: Float[Tensor, "p 4 4"], point: Float[Tensor, "c 3"]) -> Int[Tensor, " c"]:
+    """The pose nearest to each point; none where there is no pose."""
+    if not len(pose):
+        return torch.zeros(0, dtype=torch.long, device=pose.device)
+    _, nearest = KDTree(pose[:, :3, 3].cpu().numpy()).query(point.cpu().numpy())
+    return torch.as_tensor(nearest, dtype=torch.long, device=pose.device)
+
+
+def adjust(bundle: Bundle) -> lm.LmState:
+    """The state at the end of the adjustment; the bundle holds its values."""
+    state = begun = start(bundle)
+    for _, after in steps(bundle, begun):
+        state = after
+    return state
+
+
+@torch.no_grad()
+def start(bundle: Bundle) -> lm.LmState:
+    """The state before the first step: lanes matched, scales as wide as the residuals show."""
+    bundle.refresh()
+    return lm.init(bundle.problem(), bundle.values(), bundle.config.lm)
+
+
+def steps(bundle: Bundle, state: lm.LmState, *, first: int = 0) -> Iterator[tuple[int, lm.LmState]]:
+    """Every step's number, from `first` on, and the state after it, until the adjustment is finished or out of steps."""
+    backend = bundle.backend()
+    for number in range(first, bundle.config.lm.max_iterations):
+        state, finished = adjust_step(bundle, state, backend)
+        yield number, state
+        if finished:
+            break
+
+
+@torch.no_grad()
+def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple[lm.LmState, bool]:
+    """One step of the solver, folded into the bundle, and whether the adjustment is finished.
+
+    Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
+    first come to rest, and when the solver stops. It is finished when that changes nothing.
+    """
+    state = lm.step(bundle.problem(), state, bundle.config.lm, backend=backend)
+    if not bool(state.accepted.all()):
+        return state, state.done
+    bundle.fold(dict(state.values))
+    at_rest = bundle.refresh()
+    if at_rest and (state.done or int(bundle.judged) == 0):
+        at_rest = not bundle.judge(backend)
+    if state.done and at_rest:
+        return state, True
+    return lm.changed(state), False
+
+
+def _observations(
+    journeys: Sequence[Journey],
+    roads: Sequence[RoadEstimate],
+    signs: Signs,
+    lanes: Lanes,
+    associations: Sequence[Association],
+    T_world_camera: Float[Tensor, "f 4 4"],
+    config: AdjustConfig,
+) -> Observations:
+    """Corners of signs, and lane points that lie near a lane of the map with the lane and parameter each starts at."""
+    corners = corner_observations(journeys, associations, signs, box_sigma=config.box_sigma)
+    points = lane_point_observations(
+        journeys,
+        roads,
+        keyframe_spacing=config.keyframe_spacing_m,
+        points_per_detection=config.points_per_detection,
+        height_sigma=config.lane_height_sigma_m,
+    )
+    ray = torch.nn.functional.pad(points.ideal, (0, 1), value=1.0)
+    h = points.normal_camera * points.camera_height[:, None]
+    distance = h.square().sum(-1) / (h * ray).sum(-1)
+    near = (distance > 0) & (distance < config.max_ground_distance_m)
+    points, ray, h = points[near], ray[near], h[near]
+    ground = plane.ground_points(ray, h, T_world_camera[points.frame])
+    lane, t = nearest_lanes(ground, lanes, gate=config.lane_gate_m)
+    found = lane >= 0
+    matches = LaneMatches(lane[found], t[found], points.ideal[found], found[found])
+    return Observations(corners, points[found], matches)
+
+
+def _fixed_terms(
+    values: dict[str, Tensor],
+    signs: Signs,
+    lanes: Lanes,
+    corners: CornerObservations,
+    control: ControlSigns | None,
+    config: AdjustConfig,
+) -> dict[str, CostTerm]:
+    """What is known of signs and lanes before anything is seen of them."""
+    fixed = _lane_prior(values["lane"], lanes, config)
+    if len(corners):
+        facing = against_the_drive(values["pose"][corners.frame], corners.sign, len(signs))
+        # Signs that nobody sees stay as they are.
+        own = corners.sign.unique()
+        fixed["sign_habit"] = habit_term(facing[own], own, config.habit)
+    if control is not None and len(control):
+        fixed["control"] = _control_term(control, signs)
+    return fixed
+
+
+def _control_term(control: ControlSigns, signs: Signs) -> CostTerm:
+    """Surveyed centres of signs; a sign's centre is the mean of its corners."""
+    shape = signs.shape[control.sign]
+    mask = polygon.corner_mask(shape)[..., None].to(control.center_world)
+    template = (polygon.template(shape).to(mask) * mask).sum(1) / mask.sum(1)
+    return CostTerm(
+        sign_place,
+        (("sign", control.sign), ("size", control.sign)),
+        (template, control.center_world),
+        1 / control.sigma,
+    )
+
+
+def _lane_prior(
+    coefficient: Float[Tensor, "c 3"], lanes: Lanes, config: AdjustConfig
+) -> dict[str, CostTerm]:
+    """What holds control points together where observations do not.
+
+    Not where they started: that would count the journeys' own positions twice.
+    """
+    if not len(lanes):
+        return {}
+    spline, rank = spline_basis.rows(lanes.control_count)
+    along = spline_basis.derivative_flat(
+        lanes.control.point_world, lanes.control_count, rank.to(coefficient), spline
+    )
+    up = torch.zeros_like(along)
+    up[:, 2] = 1
+    forward = torch.nn.functional.normalize(along, dim=-1)
+    left = torch.nn.functional.normalize(torch.linalg.cross(up, forward), dim=-1)
+    axes = torch.stack((forward, left, torch.linalg.cross(forward, left)), dim=-1)
+    place = CostTerm(
+        lane_prior,
+        (("lane", torch.arange(len(coefficient), device=coefficient.device)),),
+        (coefficient.clone(), axes),
+        coefficient.new_full((len(coefficient),), 1 / config.lane_place_sigma_m),
+        jacobian=lane_prior_jacobian,
+    )
+    first = torch.nonzero(spline[1:] == spline[:-1])[:, 0]
+    step = CostTerm(
+        lane_stretch,
+        (("lane", first), ("lane", first + 1)),
+        (coefficient[first + 1] - coefficient[first], axes[first]),
+        (1 / coefficient.new_tensor(config.lane_step_sigma_m)).expand(len(first), 3).contiguous(),
+        jacobian=lane_stretch_jacobian,
+    )
+    return {"lane_prior": place, "lane_stretch": step}
+
+
+@torch.no_grad()
+def read_poses(bundle: Bundle, journeys: Sequence[Journey]) -> tuple[Float[Tensor, "_ 4 4"], ...]:
+    """Refined camera poses of every frame; frames without observations take the drift of those around them."""
+    values = bundle.values()
+    offsets = frame_offsets(journeys)
+    poses = []
+    nodes = bundle.prior.nodes
+    for number, (journey, a, b) in enumerate(zip(journeys, offsets, offsets[1:], strict=False)):
+        mine = torch.nonzero((bundle.frame >= a) & (bundle.frame < b))[:, 0]
+        if not len(mine):
+            poses.append(journey.T_world_camera)
+            continue
+        of_journey = torch.nonzero(nodes.journey == number)[:, 0]
+        known, drift = nodes.way[of_journey], values["drift"][of_journey]
+        way = station(journey.T_world_camera)
+        after = torch.searchsorted(known, way).clamp(1, max(len(known) - 1, 1))
+        after = after.clamp_max(len(known) - 1)
+        before = (after - 1).clamp_min(0)
+        span = (known[after] - known[before]).clamp_min(1e-9)
+        share = ((way - known[before]) / span).clamp(0, 1)[:, None]
+        between = drift[before] + share * (drift[after] - drift[before])
+        refined = se3.retract(journey.T_world_camera, between)
+        refined[bundle.frame[mine] - a] = values["pose"][mine]
+        poses.append(refined)
+    return tuple(poses)
+
+
+@torch.no_grad()
+def read_map(
+    bundle: Bundle, signs: Signs, lanes: Lanes, uncertainty: MapUncertainty | None = None
+) -> tuple[Signs, Lanes]:
+    """Adjusted signs and lanes, with the covariances of `uncertainty` where it is given."""
+    values = bundle.values()
+    point = spline_basis.from_coefficients_flat(values["lane"], lanes.control_count)
+    signs = replace(signs, T_world_sign=values["sign"], size=values["size"])
+    control = replace(lanes.control, point_world=point)
+    if uncertainty is not None:
+        signs = replace(signs, covariance=uncertainty.center)
+        control = replace(control, sigma=uncertainty.lane_sigma)
+    return signs, replace(lanes, control=control)

@@ -1,0 +1,435 @@
+"""The unknowns of bundle adjustment, the observations of them, and the problem that they make (V-B, eq:ba)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
+from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
+from crowdmap_torch.geometry import se3, spline_basis
+from crowdmap_torch.noise.pixels import noise_by_box, shared_error
+from crowdmap_torch.noise.pose_prior import PosePrior, PosePriorConfig
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.innovation_gate import innovations
+from crowdmap_torch.optim.linearize import residuals as whitened_residuals
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
+from crowdmap_torch.optim.robust import JointTukey, Tukey, median_scale
+from crowdmap_torch.optim.solvers.bordered import BorderedBackend
+from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBackend
+from crowdmap_torch.optim.solvers.normal_equations import MapBackend
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.residuals import lane, reprojection, sign_prior
+from crowdmap_torch.residuals.sign_prior import SignHabit
+
+_PIXEL_DIM = 2
+"""Numbers of a corner's residual: u and v."""
+_FIRST_REACH = 2.0
+"""Factor by which the bound on a detection's error is wider until detections are judged: a wrong start gives up few."""
+_MOST_JUDGEMENTS = 2
+"""Detections are judged no more often than this, should some of them come and go."""
+_NARROWS = 0.97
+"""A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
+_SCALE_RESTS = 0.005
+"""A scale of the prior that would change by less than this share is at rest."""
+
+
+@dataclass(frozen=True)
+class AdjustConfig:
+    """Bundle adjustment (V-B)."""
+
+    lm: lm.LmConfig = field(
+        default_factory=lambda: lm.LmConfig(
+            max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9, max_stretch=3.0
+        )
+    )
+    """The solver; its tolerance counts once the scales stand still."""
+    prior: PosePriorConfig = field(default_factory=PosePriorConfig)
+    """What the poses may be wrong by."""
+    tukey_c: float = 4.685
+    """Residuals beyond this many standard deviations have no weight; the corners of a detection are judged together, by a
+    bound that is as efficient."""
+    sign_sigma_px: float = 0.5
+    """Least standard deviation of a sign corner of a large box; more where the residuals say so."""
+    box_sigma: float = 0.5
+    """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, as a share of them."""
+    habit: SignHabit = field(default_factory=SignHabit)
+    """What signs are like before anything is seen of them."""
+    size_classes_m: tuple[tuple[float, float], ...] = ()
+    """Widths and heights that signs are made in: one that is near such a size is drawn to it, others are not. None: sizes
+    are what the images say."""
+    size_class_sigma: float = 0.005
+    """1-sigma of the width and height of signs about their class, as a share."""
+    innovation_chance: float = 1e-5
+    """Detections further from what everything else foresees than normal noise brings them with this chance are given up;
+    0: none."""
+    lane_sigma_px: float = 0.8
+    """Least standard deviation of a lane point across the marker."""
+    lane_correlation: float = 1.0
+    """Least factor on the lane points' sigma, as the points of one detection err together; more where the residuals
+    say so."""
+    lane_height_sigma_m: float = 0.05
+    """How well the road under the car tells a marker's height."""
+    lane_gate_m: float = 0.9
+    """Lane points further from every lane than this, before adjustment, are left out."""
+    lane_step_sigma_m: tuple[float, float, float] = (0.2, 0.5, 0.3)
+    """How much the step from one control point to the next may change: along the marker, across it, upwards."""
+    lane_place_sigma_m: float = 30.0
+    """Prior of a control point's place: only there to keep a marker that nothing holds."""
+    lane_slide_m: float = 0.3
+    """How far a control point may about slide along its marker in one step of the solver."""
+    drift_spacing_m: float = 1.0
+    """Stretch over which the drift of the poses is taken to stand still."""
+    keyframe_spacing_m: float = 3.0
+    """Lane points are taken from frames this far apart."""
+    points_per_detection: int = 5
+    """Most points of a lane detection that are used."""
+    max_ground_distance_m: float = 25.0
+    """Lane points that meet the road further ahead are left out."""
+    frame_spacing_m: float = 0.25
+    """Frames closer together than this (a car at a light) are thinned."""
+    dense_unknowns: int = 12000
+    """Unknowns of signs and lanes up to which their system is one dense matrix; larger ones are solved by conjugate
+    gradients, matrix-free, and their covariances estimated from samples."""
+    covariance_samples: int = 64
+    """Samples of the map that such covariances are estimated from; their sigmas are then good to 9 %."""
+
+    def __post_init__(self) -> None:
+        """Refuses size classes that no sign can have, and a chance that is none."""
+        if any(side <= 0 for sides in self.size_classes_m for side in sides):
+            raise ValueError(
+                f"size_classes_m: expected positive widths and heights in metres, found {self.size_classes_m}"
+            )
+        if not 0 <= self.innovation_chance < 1:
+            raise ValueError(
+                f"innovation_chance: expected a chance from 0 to less than 1, found {self.innovation_chance}"
+            )
+        if self.size_class_sigma <= 0:
+            raise ValueError(
+                f"size_class_sigma: expected a positive share, found {self.size_class_sigma}"
+            )
+
+
+VARIABLES = {
+    "pose": Variable(6, se3.retract),
+    "drift": Variable(6, euclidean),
+    "bias": Variable(6, euclidean),
+    "sign": Variable(6, se3.retract),
+    "size": Variable(2, positive),
+    "lane": Variable(3, euclidean),
+}
+"""The unknowns: camera poses, their slow errors and each journey's constant one; signs, their sides, lanes' coefficients."""
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Where the unknowns start, and what they are of."""
+
+    values: dict[str, Tensor]
+    """By name of `VARIABLES`."""
+    frame: Int[Tensor, " p"]
+    """Frame of each pose, counted over all journeys."""
+    lane_count: Int[Tensor, " n"]
+    """Coefficients of each lane."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What images say of them."""
+
+    corners: CornerObservations
+    lane_points: LanePointObservations
+    matches: LaneMatches
+    """Where each lane point starts."""
+
+    def renumbered(self, row_of_frame: Int[Tensor, " f"]) -> Observations:
+        """Those of the frames that have a row, by rows; -1: the frame has none."""
+        corner, point = row_of_frame[self.corners.frame], row_of_frame[self.lane_points.frame]
+        of_corner, of_point = corner >= 0, point >= 0
+        return Observations(
+            replace(self.corners[of_corner], frame=corner[of_corner]),
+            replace(self.lane_points[of_point], frame=point[of_point]),
+            self.matches[of_point],
+        )
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is known of them before."""
+
+    poses: PosePrior
+    fixed: dict[str, CostTerm]
+    """Of signs and lanes: terms that stay as they are."""
+    beside: Int[Tensor, " c"]
+    """The pose nearest to each lane coefficient at the start."""
+
+
+class Bundle(nn.Module):
+    """The unknowns of bundle adjustment and all observations of them.
+
+    Every unknown is a base value on its manifold (a buffer) and a tangent increment (an `nn.Parameter`) that is zero at
+    rest: `state_dict()` is the checkpoint, `.to(device)` moves everything, and an optimiser that steps the increments
+    stays on the manifold.
+    """
+
+    match_t: Tensor
+    match_valid: Tensor
+    scale: Tensor
+    """Standard deviation of sign corners of large boxes, and of lane points [px], as the residuals show it; factor on
+    that of lane points, as those of one detection err together."""
+    small_box: Tensor
+    """Box [px] at which a corner's standard deviation is 1.41 times that of a large box."""
+    judged: Tensor
+    """How often detections were judged by everything else."""
+    given_up: Tensor
+    """Detections, by number, that have no say."""
+    prior_scale: Tensor
+    """By journey, how far bias, drift and rotation are from the sigmas of `prior`."""
+
+    def __init__(
+        self, unknowns: Unknowns, observations: Observations, priors: Priors, config: AdjustConfig
+    ) -> None:
+        super().__init__()
+        values, corners = unknowns.values, observations.corners
+        self.variables = VARIABLES
+        self.names = tuple(values)
+        for name, value in values.items():
+            self.register_buffer(f"base_{name}", value.clone())
+            increment = value.new_zeros(len(value), self.variables[name].tangent_dim)
+            self.register_parameter(f"delta_{name}", nn.Parameter(increment))
+        self.register_buffer("scale", torch.full((3,), torch.inf, dtype=values["pose"].dtype))
+        self.register_buffer("small_box", torch.zeros_like(self.scale[0]))
+        last = int(corners.detection.max()) + 1 if len(corners) else 0
+        given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
+        self.register_buffer("given_up", given_up)
+        self.register_buffer("judged", torch.zeros_like(given_up, dtype=torch.long).sum())
+        self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
+        self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
+        self.corners, self.lane_points = corners, observations.lane_points
+        self.matches = observations.matches
+        self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
+        self.config = config
+        # Where each lane point was followed to is part of the checkpoint: matching starts from there.
+        self.register_buffer("match_t", self.matches.t.clone())
+        self.register_buffer("match_valid", self.matches.valid.clone())
+        self.is_refreshed = False
+        self.register_load_state_dict_post_hook(_forget_refresh)
+
+    def values(self) -> dict[str, Tensor]:
+        """Base values moved by the increments."""
+        return {
+            name: self.variables[name].retract(
+                getattr(self, f"base_{name}"), getattr(self, f"delta_{name}")
+            )
+            for name in self.names
+        }
+
+    @torch.no_grad()
+    def fold(self, values: dict[str, Tensor]) -> None:
+        """Makes `values` the base and sets the increments to zero."""
+        for name in self.names:
+            getattr(self, f"base_{name}").copy_(values[name])
+            getattr(self, f"delta_{name}").zero_()
+
+    def backend(self) -> MapBackend:
+        """The solver's back end: frames hang on the drift's chains, both are eliminated, the biases go last."""
+        nodes = self.prior.nodes
+        plan = EliminationPlan("drift", nodes.journey, "pose", nodes.of_frame, border="bias")
+        landmarks = ("sign", "size", "lane")
+        unknowns = sum(getattr(self, f"delta_{name}").numel() for name in landmarks)
+        if unknowns > self.config.dense_unknowns:
+            return ConjugateGradientBackend(plan, samples=self.config.covariance_samples)
+        return BorderedBackend(plan)
+
+    @torch.no_grad()
+    def refresh(self) -> bool:
+        """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
+
+        The scales of pixels start at what the residuals show, so that a wrong start does not make outliers of
+        everything, and fall as the fit improves; they never grow again. Those of the poses' prior follow the drift.
+        """
+        values = self.values()
+        if len(self.lane_points):
+            pose = values["pose"][self.lane_points.frame]
+            last = replace(self.matches, t=self.match_t, valid=self.match_valid)
+            self.matches = follow(last, self.lane_points, pose, values["lane"], self.lane_count)
+            self.match_t, self.match_valid = self.matches.t, self.matches.valid
+        at_rest = self._narrow(values)
+        rescaled = self.prior.rescaled(values["drift"], self.prior_scale)
+        moved = (rescaled / self.prior_scale).log().abs() > _SCALE_RESTS
+        # Within that they stay as they are, to the last digit: the cost is to fall from step to step.
+        self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))
+        self.is_refreshed = True
+        return at_rest and not bool(moved.any())
+
+    @torch.no_grad()
+    def judge(self, backend: MapBackend) -> bool:
+        """Gives detections up that everything else is too much against, at the minimum; returns whether any changed.
+
+        What they are judged by is their innovation: of the nearest view of a sign the residual says little, as the pose
+        goes where that view wants it. From the first time on the bound on residuals is as narrow as it is to be.
+        """
+        if int(self.judged) >= _MOST_JUDGEMENTS:
+            return False
+        problem, values, given_up = self.problem(), self.values(), torch.zeros_like(self.given_up)
+        if self.config.innovation_chance and len(self.corners):
+            of_pose = backend.assemble(problem, values).conditional_covariance("pose")
+            term = problem.terms["sign_reprojection"]
+            found = innovations(term, self.variables, values, of_pose)
+            assert isinstance(term.loss, JointTukey)
+            too_large = found.are_too_large(self.config.innovation_chance)
+            given_up[self.corners.detection] = too_large[term.loss.run]
+        first, changed = int(self.judged) == 0, not torch.equal(given_up, self.given_up)
+        self.judged += 1
+        self.given_up.copy_(given_up)
+        return first or changed
+
+    def _narrow(self, values: dict[str, Tensor]) -> bool:
+        """Narrows the scales of pixels to what the residuals show; returns whether they have come to rest."""
+        config = self.config
+        seen = self.scale.new_tensor(
+            [config.sign_sigma_px, config.lane_sigma_px, config.lane_correlation]
+        )
+        small_box = self.small_box
+        for term in self._corner_term(1.0).values():
+            # Of a two-dimensional normal residual the median length is 1.1774 sigma.
+            length = whitened_residuals(term, values).norm(dim=-1) / 1.1774
+            tight = self.corners.loose_px == 0
+            noise = noise_by_box(length[tight], self.corners.box_px[tight])
+            seen[0] = noise.large_px.clamp_min(config.sign_sigma_px)
+            small_box = noise.small_box_px
+        if len(self.lane_points):
+            valid, rows = self.matches.valid, self.lane_points
+            term = self._lane_terms(1.0)["lane_reprojection"]
+            residual = whitened_residuals(term, values)[valid, 0]
+            seen[1] = median_scale(residual, floor=config.lane_sigma_px)
+            together = shared_error(residual, rows.frame[valid], rows.detection[valid])
+            seen[2] = together.clamp_min(config.lane_correlation)
+        narrows = seen < _NARROWS * self.scale
+        self.scale.copy_(torch.where(narrows, seen, self.scale))
+        self.small_box.copy_(torch.where(narrows[0], small_box, self.small_box))
+        return not bool(narrows.any())
+
+    def problem(self) -> Problem:
+        """The least-squares problem with the matches and scales of the moment, lanes held where they are.
+
+        Of a bundle that was never refreshed, or not since it was loaded, they are found first.
+        """
+        return Problem(self.variables, {**self._terms(self.prior_scale), **self._slide_term()})
+
+    def information(self, prior_scale: Float[Tensor, "j 3"]) -> Problem:
+        """The problem whose Hessian tells what is known: nothing held, `prior_scale` for that of the bundle.
+
+        The weights of detections are raised to what they keep of the information.
+        """
+        terms = {
+            name: replace(term, loss=term.loss.informative())
+            if isinstance(term.loss, JointTukey)
+            else term
+            for name, term in self._terms(prior_scale).items()
+        }
+        return Problem(self.variables, terms)
+
+    def _terms(self, prior_scale: Float[Tensor, "j 3"]) -> dict[str, CostTerm]:
+        if not self.is_refreshed:
+            self.refresh()
+        terms = {**self.prior.terms(prior_scale), **self.fixed}
+        terms.update(self._size_term())
+        terms.update(self._corner_term(self.corner_sigma()))
+        terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))
+        return terms
+
+    def corner_sigma(self) -> Float[Tensor, " m"]:
+        """Standard deviation of every sign corner in u and in v [px]."""
+        box, loose = self.corners.box_px, self.corners.loose_px
+        variance = self.scale[0].square() * (1 + (self.small_box / box).square())
+        return (variance + loose.square()).sqrt()
+
+    def _corner_term(self, sigma: float | Float[Tensor, " m"]) -> dict[str, CostTerm]:
+        rows = self.corners
+        if not len(rows):
+            return {}
+        reach = _FIRST_REACH if int(self.judged) == 0 else 1.0
+        bound = self.scale.new_tensor(self.config.tukey_c * reach)
+        loss = JointTukey.by_efficiency(rows.detection, bound, row_dim=_PIXEL_DIM)
+        term = CostTerm(
+            reprojection.sign_reprojection,
+            (("pose", rows.frame), ("sign", rows.sign), ("size", rows.sign)),
+            (rows.template, rows.matrix),
+            rows.template.new_ones(len(rows)) / sigma,
+            loss.without(self.given_up[rows.detection]),
+            reprojection.sign_reprojection_jacobian,
+        )
+        return {"sign_reprojection": term}
+
+    def _size_term(self) -> dict[str, CostTerm]:
+        size = self.values()["size"].detach()
+        classes = size.new_tensor(self.config.size_classes_m)
+        if not len(classes) or not len(size):
+            return {}
+        away = (size[:, None] / classes).log().square().sum(-1)
+        term = CostTerm(
+            sign_prior.size_class,
+            (("size", torch.arange(len(size), device=size.device)),),
+            (classes[away.argmin(1)],),
+            size.new_full((len(size),), 1 / self.config.size_class_sigma),
+            Tukey(self.config.tukey_c),
+        )
+        return {"size_class": term}
+
+    def _slide_term(self) -> dict[str, CostTerm]:
+        """Keeps lanes from sliding along themselves within a step: nothing in the images says where they are.
+
+        The hold is at the place of the moment, so it does not pull; the map's covariance is taken without it.
+        """
+        if not len(self.lane_points):
+            return {}
+        values = self.values()
+        index = torch.arange(len(self.beside), device=self.beside.device)
+        offset = (values["lane"] - values["pose"][self.beside, :3, 3]).detach()
+        along = self.fixed["lane_prior"].constants[1][:, :, 0]
+        term = CostTerm(
+            lane.lane_slide,
+            (("pose", self.beside), ("lane", index)),
+            (offset, along),
+            offset.new_full((len(offset),), 1 / self.config.lane_slide_m),
+            jacobian=lane.lane_slide_jacobian,
+        )
+        return {"lane_slide": term}
+
+    def _lane_terms(self, sigma: float) -> dict[str, CostTerm]:
+        rows = self.lane_points
+        if not len(rows):
+            return {}
+        count, of = self.lane_count, self.matches.lane
+        coefficient, weight, _ = spline_basis.window_flat(
+            self.matches.t.clamp_min(0), spline_basis.starts(count)[of], count[of]
+        )
+        lane_slots = (("lane", column.contiguous()) for column in coefficient.unbind(1))
+        slots, valid = (("pose", rows.frame), *lane_slots), self.matches.valid.to(weight)
+        image = CostTerm(
+            lane.lane_reprojection,
+            slots,
+            (weight, self.matches.normal_px, rows.matrix),
+            valid / sigma,
+            Tukey(self.config.tukey_c),
+            lane.lane_reprojection_jacobian,
+        )
+        height = CostTerm(
+            lane.lane_height,
+            slots,
+            (weight, rows.normal_camera, rows.camera_height),
+            valid / rows.height_sigma,
+            Tukey(self.config.tukey_c),
+            lane.lane_height_jacobian,
+        )
+        return {"lane_reprojection": image, "lane_height": height}
+
+
+def _forget_refresh(bundle: nn.Module, _: object) -> None:
+    """What was loaded has matches and scales of its own."""
+    assert isinstance(bundle, Bundle)
+    bundle.is_refreshed = False

@@ -1,0 +1,124 @@
+"""How sure an adjusted map is: covariances of signs, their corners, lanes and journeys' errors, from one factorisation.
+
+The covariance of the landmarks is the inverse of the reduced system that bundle adjustment solves, poses and biases
+marginalised; what all positions share is kept apart. Of a map too large for that inverse, samples are drawn instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.geometry import polygon, se3, spline_basis
+from crowdmap_torch.optim.problem import Values
+from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, MapCovariance
+from crowdmap_torch.tables import Lanes, Signs
+
+_MOST_PLACES = 500
+"""Places along the lanes of a map without signs at which it is asked what all have in common."""
+
+
+@dataclass(frozen=True)
+class MapUncertainty:
+    """Covariances of an adjusted map, absolute: what all positions share included."""
+
+    center: Float[Tensor, "n 3 3"]
+    """Of the signs' centres [m^2]."""
+    corner: Float[Tensor, "n 8 3 3"]
+    """Of the signs' corners, in the order of FORMAT.md [m^2]."""
+    lane_sigma: Float[Tensor, " c"]
+    """1-sigma of the lateral position at the lanes' control points [m]."""
+    shared: Float[Tensor, "3 3"]
+    """What all positions have in common: the largest covariance that can be taken off all of them together so that
+    what is left is a covariance [m^2]."""
+    bias: Float[Tensor, "j 4"]
+    """By journey the mean error of its poses along the way, the adjusted minus the given ones: east, north, up [m] and
+    heading [rad], counted from east to north. NaN for journeys that had no say."""
+    bias_covariance: Float[Tensor, "j 4 4"]
+
+
+@torch.no_grad()
+def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertainty:
+    """Covariances at the bundle's values; `signs` and `lanes` are those that it was built from."""
+    values = bundle.values()
+    nodes = bundle.prior.nodes
+    journeys = len(values["bias"])
+    expected = bundle.prior.expected_scale(values["drift"], bundle.prior_scale)
+    covariance = bundle.backend().assemble(bundle.information(expected), values).covariance()
+    to_bias = _to_bias(values["pose"][nodes.first])
+    count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)
+    of_bias = covariance.of_chain_sums(to_bias.mT / count[nodes.journey, None, None])
+    every = torch.arange(len(signs), device=count.device)
+    sign = LinearFunctions.of_tangents((("sign", every), ("size", every)), to_bias, 6, 2)
+    of_sign = covariance.of(sign)
+    shared = _shared(covariance, values, to_bias)
+    bias = (to_bias @ values["drift"][..., None])[..., 0]
+    bias = nodes.mean(bias, journeys)
+    silent = count == 0
+    return MapUncertainty(
+        center=of_sign[:, :3, :3],
+        corner=_corner_covariance(values["sign"], values["size"], signs, of_sign),
+        lane_sigma=_lane_sigma(bundle, lanes, covariance),
+        shared=(shared + shared.mT) / 2,
+        bias=bias.masked_fill(silent[:, None], torch.nan),
+        bias_covariance=of_bias.masked_fill(silent[:, None, None], torch.nan),
+    )
+
+
+def _shared(covariance: MapCovariance, values: Values, like: Tensor) -> Float[Tensor, "3 3"]:
+    """What the positions of all signs have in common; of a map without signs, those along its lanes."""
+    for name, dim in (("sign", 6), ("lane", 3)):
+        every = torch.arange(len(values[name]), device=like.device)
+        if name == "lane":
+            every = every[:: max(len(every) // _MOST_PLACES, 1)]
+        if len(every):
+            position = torch.eye(3, dim).to(like).expand(len(every), 3, dim)
+            return covariance.common(LinearFunctions(((name, every),), (position,)))
+    return like.new_zeros(3, 3)
+
+
+def _to_bias(T_world_camera: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 6"]:
+    """What takes the error of a pose to that of its position and of its heading."""
+    matrix = T_world_camera.new_zeros(len(T_world_camera), 4, 6)
+    matrix[:, :3, :3] = torch.eye(3).to(matrix)
+    # The rotation is about the camera's axes; its part about world up is the heading.
+    matrix[:, 3, 3:] = T_world_camera[:, 2, :3]
+    return matrix
+
+
+def _corner_covariance(
+    T_world_sign: Float[Tensor, "n 4 4"],
+    size: Float[Tensor, "n 2"],
+    signs: Signs,
+    joint: Float[Tensor, "n 8 8"],
+) -> Float[Tensor, "n 8 3 3"]:
+    """Covariance of each corner from that of the sign's pose and size, corners in the order of FORMAT.md."""
+    T, canonical_size = polygon.canonical(T_world_sign, size, signs.shape)
+    corner_world = se3.transform(T[:, None], polygon.corners(signs.shape, canonical_size))
+    corner = se3.transform(se3.inverse(T_world_sign)[:, None], corner_world)
+    R = T_world_sign[:, None, :3, :3].expand(-1, corner.shape[1], 3, 3)
+    # By translation, by turning about the sign's axes (w x c), and by the relative change of its sides.
+    by_turn = -R @ se3.skew(corner)
+    by_size = R[..., :2] * corner[..., None, :2]
+    J = torch.cat((torch.eye(3).to(R).expand_as(R), by_turn, by_size), dim=-1)
+    return J @ joint[:, None] @ J.mT
+
+
+def _lane_sigma(bundle: Bundle, lanes: Lanes, covariance: MapCovariance) -> Float[Tensor, " c"]:
+    """1-sigma of every control point across its lane; a control point is a weighted sum of coefficients."""
+    if not len(lanes):
+        return bundle.lane_points.camera_height.new_zeros(0)
+    count = lanes.control_count
+    spline, rank = spline_basis.rows(count)
+    start = spline_basis.starts(count)
+    across = bundle.fixed["lane_prior"].constants[1][:, :, 1]
+    row, weight, _ = spline_basis.window_flat(rank.to(across), start[spline], count[spline])
+    by_coefficient = weight[:, :, None] * across[:, None]
+    point = LinearFunctions(
+        tuple(("lane", of) for of in row.unbind(1)), by_coefficient[:, None].unbind(2)
+    )
+    return covariance.of(point)[:, 0, 0].clamp_min(0).sqrt()

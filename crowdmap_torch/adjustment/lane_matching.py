@@ -1,0 +1,154 @@
+"""Which point of which spline a lane point shows: found once in the world, then followed in the image between steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from crowdmap_torch.adjustment.observations import LanePointObservations
+from crowdmap_torch.geometry import plane, spline_basis
+from crowdmap_torch.residuals.reprojection import MIN_DEPTH
+from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Rows
+
+_STEPS = 4
+"""Gauss-Newton steps along the projected spline; it is nearly straight at a lane point's scale."""
+_SLACK = 0.05
+"""Knots beyond a spline's end at which a match is lost, and within it at which a lost one is taken up again."""
+
+
+@dataclass(frozen=True)
+class LaneMatches(Rows):
+    """The spline point that each lane point is held against."""
+
+    lane: Int[Tensor, " m"]
+    t: Float[Tensor, " m"]
+    """Parameter of the closest point, in knots."""
+    normal_px: Float[Tensor, "m 2"]
+    """Image normal of the projected spline there."""
+    valid: Bool[Tensor, " m"]
+    """False where the closest point is beyond the spline's end or behind the camera; `follow` looks at what was."""
+
+
+def nearest_lanes(
+    point_world: Float[Tensor, "m 3"], lanes: Lanes, *, gate: float
+) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+    """Nearest lane within `gate` metres horizontally (-1: none) and the parameter of its nearest sample."""
+    count = lanes.control_count
+    none = torch.full((len(point_world),), -1, device=point_world.device)
+    if not len(lanes) or not len(point_world):
+        return none, torch.zeros_like(point_world[:, 0])
+    piece, t = sample_parameters(lanes, spacing=0.5)
+    samples = spline_basis.evaluate_flat(lanes.control.point_world, count, t, piece)
+    # Heights of a first guess are off by more than markers are apart; a bridge is not.
+    squash = samples.new_tensor([1.0, 1.0, 0.3])
+    tree = KDTree((samples * squash).cpu().numpy())
+    distance, index = tree.query((point_world * squash).cpu().numpy(), distance_upper_bound=gate)
+    found = torch.as_tensor(distance, device=t.device) < gate
+    index = torch.as_tensor(index, device=t.device).clamp_max(len(samples) - 1)
+    return torch.where(found, piece[index], none), t[index]
+
+
+def sample_parameters(
+    lanes: Lanes, *, spacing: float
+) -> tuple[Int[Tensor, " s"], Float[Tensor, " s"]]:
+    """Pieces and parameters of samples about `spacing` metres apart along every lane, both ends included."""
+    count = lanes.control_count
+    point = lanes.control.point_world
+    piece = lanes.piece_of_control
+    chord = (point[1:] - point[:-1]).norm(dim=-1) * (piece[1:] == piece[:-1])
+    length = point.new_zeros(len(lanes)).index_add_(0, piece[:-1], chord)
+    samples = (length / spacing).ceil().long().clamp_min(1) + 1
+    of, rank = spline_basis.rows(samples)
+    return of, rank * (count[of] - 1) / (samples[of] - 1)
+
+
+def follow(
+    matches: LaneMatches,
+    observations: LanePointObservations,
+    T_world_camera: Float[Tensor, "m 4 4"],
+    coefficient: Float[Tensor, "c 3"],
+    count: Int[Tensor, " n"],
+) -> LaneMatches:
+    """The matches moved to the closest points of the projected splines, from where they were (V-B).
+
+    Done between steps of the solver: inside the residual it would make the Jacobian jump.
+    """
+    start = spline_basis.starts(count)[matches.lane]
+    own = count[matches.lane]
+    t = matches.t
+    M = observations.matrix @ T_world_camera[:, :3, :3].mT
+    position = T_world_camera[:, :3, 3]
+    last = (own - 1).to(t)
+    y, error, tangent = _projected(t, start, own, coefficient, M, position)
+    for _ in range(_STEPS):
+        change = (error * tangent).sum(-1) / tangent.square().sum(-1).clamp_min(1e-12)
+        # Half a knot beyond either end is far enough to see that the point is not on this spline.
+        t = torch.minimum((t - change.clamp(-2, 2)).clamp_min(-0.5), last + 0.5)
+        y, error, tangent = _projected(t, start, own, coefficient, M, position)
+    tangent = torch.nn.functional.normalize(tangent, dim=-1)
+    normal = torch.stack((-tangent[:, 1], tangent[:, 0]), dim=-1)
+    # At one border for both ways a match may come and go with every step, each step undoing the last one.
+    slack = torch.where(matches.valid, _SLACK, -_SLACK).to(t)
+    valid = (y[:, 2] > 1.0) & (t >= -slack) & (t <= last + slack)
+    return replace(matches, t=t, normal_px=normal, valid=valid)
+
+
+def _projected(
+    t: Float[Tensor, " m"],
+    start: Int[Tensor, " m"],
+    count: Int[Tensor, " m"],
+    coefficient: Float[Tensor, "c 3"],
+    matrix: Float[Tensor, "m 3 3"],
+    position: Float[Tensor, "m 3"],
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 2"], Float[Tensor, "m 2"]]:
+    """Spline points in the observations' frames, their pixel errors, and how these move with the parameter."""
+    rows, weight, d_weight = spline_basis.window_flat(t, start, count)
+    at, along = ((w[..., None] * coefficient[rows]).sum(-2) for w in (weight, d_weight))
+    y = (matrix @ (at - position)[..., None])[..., 0]
+    dy = (matrix @ along[..., None])[..., 0]
+    depth = y[:, 2:].clamp_min(MIN_DEPTH)
+    error = y[:, :2] / depth
+    return y, error, (dy[:, :2] - error * dy[:, 2:]) / depth
+
+
+def detection_lanes(
+    journey: Journey,
+    road: RoadEstimate,
+    T_world_camera: Float[Tensor, "f 4 4"],
+    lanes: Lanes,
+    *,
+    gate: float,
+    points: int = 4,
+    reach: float = 30.0,
+) -> Int[Tensor, " l"]:
+    """The lane that most of each lane detection's nearest `points` on the road lie on; -1 for none.
+
+    Points that meet the road further than `reach` metres ahead tell two markers apart no more.
+    """
+    seen, count = journey.lane_points, len(journey.lanes)
+    frame = journey.lanes.frame[seen.detection]
+    ray = torch.nn.functional.pad(seen.ideal, (0, 1), value=1.0)
+    h = road.normal_camera[frame] * road.height[frame, None]
+    distance = h.square().sum(-1) / (h * ray).sum(-1)
+    distance = torch.where((distance > 0) & (distance < reach), distance, torch.inf)
+    order = torch.argsort(distance, stable=True)
+    order = order[torch.argsort(seen.detection[order], stable=True)]
+    rank = torch.arange(len(order), device=order.device)
+    first = torch.searchsorted(seen.detection[order], seen.detection[order])
+    order = order[(rank - first < points) & distance[order].isfinite()]
+    ground = plane.ground_points(ray[order], h[order], T_world_camera[frame[order]])
+    lane, _ = nearest_lanes(ground, lanes, gate=gate)
+    found = lane >= 0
+    detection, lane = seen.detection[order][found], lane[found]
+    label = torch.full((count,), -1, device=order.device)
+    if not len(lane):
+        return label
+    key, votes = torch.unique(detection * len(lanes) + lane, return_counts=True)
+    # Most votes first, then the highest lane: one number to take the largest of.
+    ballot = votes * len(lanes) + key % len(lanes)
+    best = label.scatter_reduce(0, key // len(lanes), ballot, "amax")
+    return torch.where(best >= 0, best % len(lanes), label)

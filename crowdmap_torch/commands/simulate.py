@@ -1,0 +1,150 @@
+"""Writes a simulated dataset with exact ground truth: `crowdmap simulate OUT --world suburb --seed 0`.
+
+Every number of the presets is an option; `--help` lists them with their meaning.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import inspect
+import sys
+import time
+import types
+import typing
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+
+from crowdmap_torch.io.errors import input_read
+from crowdmap_torch.simulate.dataset import DETECTION_PRESETS, SimulationConfig, write_dataset
+from crowdmap_torch.simulate.faults import KINDS
+from crowdmap_torch.simulate.lane_perception import LaneDetectionConfig
+from crowdmap_torch.simulate.positioning import POSITIONING_PRESETS, PositioningConfig
+from crowdmap_torch.simulate.rigs import RigConfig
+from crowdmap_torch.simulate.roads import RoadShape
+from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
+from crowdmap_torch.simulate.signposts import SignConfig
+from crowdmap_torch.simulate.vehicle import VehicleConfig
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, WorldConfig
+
+_GROUPS = {
+    "world": WorldConfig,
+    "road": RoadShape,
+    "roadside": SignConfig,
+    "vehicle": VehicleConfig,
+    "rig": RigConfig,
+    "positioning": PositioningConfig,
+    "signs": SignDetectionConfig,
+    "lanes": LaneDetectionConfig,
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What `crowdmap simulate` takes."""
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the dataset")
+    parser.add_argument("--world", choices=sorted(WORLD_PRESETS), default="suburb")
+    parser.add_argument("--journeys", type=int, default=25)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--world-seed", type=int, help="seed of the world alone, if not --seed")
+    parser.add_argument("--positioning", choices=sorted(POSITIONING_PRESETS), default="paper")
+    parser.add_argument("--detection", choices=sorted(DETECTION_PRESETS), default="day")
+    parser.add_argument(
+        "--bad-drives",
+        default="",
+        metavar="KIND,...",
+        help=f"spoils one journey for each: {', '.join(KINDS)}",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replaces a dataset in OUT")
+    for name, config in _GROUPS.items():
+        group = parser.add_argument_group(name, inspect.getdoc(config))
+        hints, texts = typing.get_type_hints(config), _field_docstrings(config)
+        for f in fields(config):
+            if f.name == "name" or is_dataclass(hints[f.name]):
+                continue
+            option = "--" + f.name.replace("_", "-")
+            group.add_argument(
+                option,
+                dest=f"{name}.{f.name}",
+                default=None,
+                help=texts.get(f.name, "").replace("%", "%%") or None,
+                **_kind(hints[f.name]),
+            )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Writes the dataset into `options.out`."""
+    world = WORLD_PRESETS[options.world]
+    signs, lanes = DETECTION_PRESETS[options.detection]
+    with input_read():
+        config = SimulationConfig(
+            world=_changed(
+                world,
+                options,
+                "world",
+                road=_changed(world.road, options, "road"),
+                signs=_changed(world.signs, options, "roadside"),
+            ),
+            vehicle=_changed(VehicleConfig(), options, "vehicle"),
+            rig=_changed(RigConfig(), options, "rig"),
+            positioning=_changed(POSITIONING_PRESETS[options.positioning], options, "positioning"),
+            signs=_changed(signs, options, "signs"),
+            lanes=_changed(lanes, options, "lanes"),
+            journeys=options.journeys,
+            seed=options.seed,
+            world_seed=options.world_seed,
+            bad_drives=tuple(kind for kind in options.bad_drives.split(",") if kind),
+        )
+        begun = time.perf_counter()
+        built = write_dataset(
+            config, options.out, overwrite=options.overwrite, on_journey=_progress(options.journeys)
+        )
+    print(
+        f"{options.out}: {options.journeys} journeys, {len(built.signs)} signs, "
+        f"{len(built.markers)} lane markers in {time.perf_counter() - begun:.1f} s"
+    )
+
+
+def _kind(hint: object) -> dict:
+    """How argparse reads a field of this type."""
+    if hint is bool:
+        return {"action": argparse.BooleanOptionalAction}
+    if typing.get_origin(hint) is tuple:
+        kinds = typing.get_args(hint)
+        return {"type": kinds[0], "nargs": len(kinds), "metavar": ("LEAST", "MOST")}
+    if isinstance(hint, types.UnionType):
+        hint = next(kind for kind in typing.get_args(hint) if kind is not type(None))
+    return {"type": hint, "metavar": "TEXT" if hint is str else "N"}
+
+
+def _field_docstrings(config: type) -> dict[str, str]:
+    """The docstrings under the fields of a dataclass."""
+    body = ast.parse(inspect.getsource(config)).body[0]
+    assert isinstance(body, ast.ClassDef)
+    texts = {}
+    for field, text in zip(body.body, body.body[1:], strict=False):
+        if not isinstance(field, ast.AnnAssign) or not isinstance(field.target, ast.Name):
+            continue
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            texts[field.target.id] = " ".join(str(text.value.value).split())
+    return texts
+
+
+def _changed(config, options: argparse.Namespace, group: str, **changes):
+    """The configuration with what the command line says of it."""
+    for f in fields(config):
+        value = getattr(options, f"{group}.{f.name}", None)
+        if value is not None:
+            changes[f.name] = tuple(value) if isinstance(value, list) else value
+    return replace(config, **changes)
+
+
+def _progress(journeys: int):
+    """A line that counts journeys on a terminal; nothing elsewhere."""
+    if not sys.stderr.isatty():
+        return lambda index: None
+
+    def show(index: int) -> None:
+        end = "\n" if index + 1 == journeys else ""
+        print(f"\rjourney {index + 1}/{journeys}", end=end, file=sys.stderr, flush=True)
+
+    return show

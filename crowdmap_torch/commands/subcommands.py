@@ -1,0 +1,41 @@
+"""Subcommands that are modules, each with `add_arguments(parser)` and `run(options)`; only the chosen one is imported."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from collections.abc import Mapping
+
+
+def add_subcommands(
+    parser: argparse.ArgumentParser, package: str, summaries: Mapping[str, str]
+) -> None:
+    """Lets `parser` choose among modules of `package`: the options then hold `module`, and `prog`, its name in messages.
+
+    A name with hyphens is a module with underscores.
+    """
+    chosen = parser.add_subparsers(
+        metavar="NAME", required=True, parser_class=ModuleParser, title="subcommands"
+    )
+    for name, summary in summaries.items():
+        own = chosen.add_parser(
+            name, help=summary, description=f"{summary[0].upper()}{summary[1:]}."
+        )
+        own.module = f"{package}.{name.replace('-', '_')}"
+
+
+class ModuleParser(argparse.ArgumentParser):
+    """Asks its module for its options when it is chosen: what the others need would count as this one's memory."""
+
+    module: str
+    """Its full name."""
+
+    def parse_known_args(self, args=None, namespace=None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The options, as the module declares them, and what is left."""
+        try:
+            module = importlib.import_module(self.module)
+        except ModuleNotFoundError as missing:
+            self.error(f"needs the Python package {missing.name!r}, which is not installed")
+        module.add_arguments(self)
+        self.set_defaults(module=module, prog=self.prog)
+        return super().parse_known_args(args, namespace)

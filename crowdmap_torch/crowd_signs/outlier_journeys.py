@@ -1,0 +1,172 @@
+"""V-B, unlike the paper: drives that do not fit the crowd, by wrong calibration, heading or position."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import group_count, group_median
+from crowdmap_torch.tables import Signs
+
+
+@dataclass(frozen=True)
+class OutlierJourneyConfig:
+    """When a journey is taken for a bad drive. Limits are in the crowd's own robust spread where they say so."""
+
+    min_signs: int = 4
+    """Journeys with fewer signs are not judged."""
+    spread: float = 6.0
+    """Figures further from the crowd's median than this many robust standard deviations are suspicious."""
+    min_matched: float = 0.5
+    """Least share of a journey's signs that others saw too where they passed, relative to the median journey's."""
+    min_bias_m: float = 4.0
+    """Biases below this are never suspicious [m]."""
+    min_scatter_m: float = 0.7
+    """Median miss of its signs, bias and drift taken off, that is never suspicious below [m]."""
+    min_turn_deg: float = 2.0
+    """Median turn of its signs against the crowd's that is never suspicious below [deg]."""
+    min_roll_deg: float = 1.5
+    """Median roll of its signs in their planes against the crowd's that is never suspicious below [deg]."""
+    min_stretch: float = 0.035
+    """Median relative size against the crowd's that is never suspicious below."""
+    min_drift_m: float = 1.25
+    """Largest drift along a journey that is never suspicious below [m]."""
+    max_leap_m: float = 4.0
+    """Largest step between two frames beyond what a car can drive [m]."""
+
+
+@dataclass(frozen=True)
+class OutlierJourney:
+    """A journey that does not fit the others, and why."""
+
+    journey: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class JourneyStatistics:
+    """How each journey fits the crowd; NaN where it has no sign to tell."""
+
+    signs: Int[Tensor, " j"]
+    """Signs triangulated."""
+    matched: Float[Tensor, " j"]
+    """Share of them that other journeys saw too, of those that others passed by."""
+    bias: Float[Tensor, " j"]
+    """Length of the bias against the crowd's median [m]."""
+    scatter: Float[Tensor, " j"]
+    """Median distance of its signs from the clusters, bias and drift taken off [m]."""
+    turn: Float[Tensor, " j"]
+    """Median turn of its signs about the up axis against their clusters [rad]."""
+    roll: Float[Tensor, " j"]
+    """Median turn of its signs in their planes against their clusters [rad]."""
+    stretch: Float[Tensor, " j"]
+    """Median logarithm of the size of its signs against their clusters'."""
+    drift: Float[Tensor, " j"]
+    """Largest drift along it [m]."""
+    leap: Float[Tensor, " j"]
+    """Largest step between two frames beyond what a car can drive [m]."""
+
+
+def journey_statistics(
+    signs: Signs,
+    label: Int[Tensor, " n"],
+    heads: Signs,
+    company: Bool[Tensor, " n"],
+    translation: Float[Tensor, "j 3"],
+    drift: Float[Tensor, " j"],
+    leap: Float[Tensor, " j"],
+) -> JourneyStatistics:
+    """How each journey fits the crowd.
+
+    `signs` have their bias taken off, `company` says of each whether others passed by, `heads` are the clusters',
+    `translation` and `drift` [m] what was taken off, `leap` [m] the largest step of the positions no car can drive.
+    """
+    journeys = len(translation)
+    used = label >= 0
+    member, head = signs[used], heads[label[used]]
+    number = group_count(signs.journey, journeys)
+    checked = group_count(signs.journey[company], journeys)
+    matched = group_count(signs.journey[company & used], journeys) / checked.clamp_min(1)
+    miss = (member.center_world - head.center_world).norm(dim=1)
+    a, b = member.normal_world, head.normal_world
+    turn = torch.atan2(b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0], (a[:, :2] * b[:, :2]).sum(1))
+    R, axes = member.T_world_sign[:, :3, :3], head.T_world_sign[:, :3, :3]
+    along = (axes.mT @ R[:, :, :1])[..., 0]
+    roll = torch.atan2(along[:, 1], along[:, 0])
+    stretch = (member.size.log() - head.size.log()).mean(1)
+    centre = translation.median(0).values if journeys else translation.sum(0)
+    return JourneyStatistics(
+        signs=number,
+        matched=torch.where(checked > 0, matched, torch.nan),
+        bias=(translation - centre).norm(dim=1),
+        scatter=group_median(miss, member.journey, journeys),
+        turn=group_median(turn, member.journey, journeys),
+        roll=group_median(roll, member.journey, journeys),
+        stretch=group_median(stretch, member.journey, journeys),
+        drift=drift,
+        leap=leap,
+    )
+
+
+def find_outlier_journeys(
+    statistics: JourneyStatistics, config: OutlierJourneyConfig
+) -> tuple[OutlierJourney, ...]:
+    """Journeys that do not fit, each with its reasons; with fewer than three journeys only a leap can tell."""
+    judged = statistics.signs >= config.min_signs
+    if int(judged.sum()) < 3:
+        judged = torch.zeros_like(judged)
+    usual = statistics.matched[judged].nanmedian()
+    few = judged & (statistics.matched < config.min_matched * usual)
+    s, radian = statistics, torch.pi / 180
+    outlying = partial(_outlying, judged=judged, spread=config.spread)
+    checks = (
+        (few, s.matched, "only {:.0%} of its signs were seen by others too"),
+        (outlying(s.bias, config.min_bias_m), s.bias, "its position is off by {:.1f} m"),
+        (
+            outlying(s.scatter, config.min_scatter_m),
+            s.scatter,
+            "its signs miss the others' by {:.2f} m after its bias is taken off",
+        ),
+        (
+            outlying(s.turn, radian * config.min_turn_deg),
+            torch.rad2deg(s.turn),
+            "its signs are turned by {:.1f} degrees against the others'",
+        ),
+        (
+            outlying(s.roll, radian * config.min_roll_deg),
+            torch.rad2deg(s.roll),
+            "its signs are rolled by {:.1f} degrees against the others'",
+        ),
+        (
+            outlying(s.stretch, config.min_stretch),
+            s.stretch.exp(),
+            "its signs are {:.2f} times the size the others see",
+        ),
+        (
+            outlying(s.drift, config.min_drift_m),
+            s.drift,
+            "its position drifts by {:.1f} m along the way",
+        ),
+        (s.leap > config.max_leap_m, s.leap, "its position leaps by {:.1f} m between two frames"),
+    )
+    reasons: dict[int, list[str]] = {}
+    for flagged, value, text in checks:
+        for j in torch.nonzero(flagged)[:, 0].tolist():
+            reasons.setdefault(j, []).append(text.format(float(value[j])))
+    return tuple(OutlierJourney(j, "; ".join(reasons[j])) for j in sorted(reasons))
+
+
+def _outlying(
+    value: Float[Tensor, " j"], floor: float, *, judged: Bool[Tensor, " j"], spread: float
+) -> Bool[Tensor, " j"]:
+    """True where a figure is above `floor` and far from those of the crowd."""
+    known = value[judged & value.isfinite()]
+    if not len(known):
+        return torch.zeros_like(judged)
+    centre = known.median()
+    scale = 1.4826 * (known - centre).abs().median()
+    return judged & ((value - centre).abs() > spread * scale) & (value.abs() > floor)

@@ -1,0 +1,282 @@
+"""IV-D: pieces of lane markers: which points belong to one, and the spline through them, all pieces in one batch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import group_range, group_sum
+from crowdmap_torch.geometry import spline_basis, spline_fit
+from crowdmap_torch.optim.robust import Tukey
+
+
+@dataclass(frozen=True)
+class LanePieces:
+    """Overlapping pieces of markers; a point may be in several of them, once a row."""
+
+    marker: Int[Tensor, " n"]
+    """The marker each piece is cut from."""
+    control_count: Int[Tensor, " n"]
+    piece: Int[Tensor, " r"]
+    point: Int[Tensor, " r"]
+    """Index of the point in the rows given."""
+    t: Float[Tensor, " r"]
+    """Parameter of the point on its piece, 0 .. control_count - 1."""
+
+    def __len__(self) -> int:
+        return len(self.marker)
+
+    def select(self, kept: Bool[Tensor, " n"]) -> LanePieces:
+        """Only the pieces at `kept`."""
+        number = kept.cumsum(0) - 1
+        rows = kept[self.piece]
+        return LanePieces(
+            self.marker[kept],
+            self.control_count[kept],
+            number[self.piece[rows]],
+            self.point[rows],
+            self.t[rows],
+        )
+
+
+@dataclass(frozen=True)
+class LaneFit:
+    """Splines through the points of pieces."""
+
+    control: Float[Tensor, "c 3"]
+    """Control points, those of one piece adjacent."""
+    sigma: Float[Tensor, " c"]
+    """1-sigma of them across the marker, from the points' noise as it turned out [m]."""
+    miss: Float[Tensor, " r"]
+    """How far each point is from its piece in the top view, positive to the right [m]."""
+    weight: Float[Tensor, " r"]
+    """Share of its own weight that a point kept; 0 for outliers."""
+
+
+def runs_of(
+    marker: Int[Tensor, " p"], along: Float[Tensor, " p"], max_gap: float
+) -> Int[Tensor, " p"]:
+    """Points of one marker numbered by runs without a gap longer than `max_gap` [m] along it."""
+    order = along.argsort()
+    order = order[marker[order].argsort(stable=True)]
+    new = torch.ones_like(order, dtype=torch.bool)
+    ahead = along[order][1:] - along[order][:-1]
+    new[1:] = (marker[order][1:] != marker[order][:-1]) | (ahead > max_gap)
+    return torch.empty_like(order).index_put((order,), new.cumsum(0) - 1)
+
+
+def cut_by_length(
+    marker: Int[Tensor, " p"],
+    along: Float[Tensor, " p"],
+    *,
+    max_gap: float,
+    length: float,
+    overlap: float,
+    control_points: int,
+) -> LanePieces:
+    """Pieces of equal length [m], a share `overlap` of it in common with the next one, for each run of points.
+
+    A run shorter than a piece is one piece, with fewer control points at the same spacing.
+    """
+    if not len(marker):
+        return _no_pieces(marker, along)
+    run = runs_of(marker, along, max_gap)
+    runs = int(run.max()) + 1
+    low, high = group_range(along, run, runs)
+    extent = high - low
+    count = ((extent - length) / (length * (1 - overlap))).ceil().clamp_min(0).long() + 1
+    piece_length = extent.clamp_max(length).clamp_min(1e-6)
+    stride = (extent - piece_length) / (count - 1).clamp_min(1)
+    first = count.cumsum(0) - count
+    # Every point is in the piece that began last before it, and in those before as far as they
+    # reach.
+    place = along - low[run]
+    latest = (place / stride[run].clamp_min(1e-6)).floor().long().clamp_max(count[run] - 1)
+    back = torch.arange(int(1 / (1 - overlap)) + 2, device=run.device)
+    rank = latest[:, None] - back
+    t = (place[:, None] - rank * stride[run, None]) / piece_length[run, None]
+    inside = (rank >= 0) & (t >= 0) & (t <= 1 + 1e-9)
+    point, which = inside.nonzero(as_tuple=True)
+    spans = (extent * (control_points - 1) / length).round().long()
+    control_count = (spans + 1).clamp(2, control_points)
+    of_run = torch.repeat_interleave(torch.arange(runs, device=run.device), count)
+    marker_of_run = marker.new_zeros(runs).index_put((run,), marker)
+    return LanePieces(
+        marker=marker_of_run[of_run],
+        control_count=control_count[of_run],
+        piece=(first[run, None] + rank)[point, which],
+        point=point,
+        t=t[point, which].clamp(0, 1) * (control_count[run[point]] - 1),
+    )
+
+
+def cut_by_number(
+    marker: Int[Tensor, " p"],
+    frame: Int[Tensor, " p"],
+    point_world: Float[Tensor, "p 3"],
+    *,
+    number: int,
+    control_points: int,
+) -> LanePieces:
+    """The paper's pieces: the `number` most recent points of a marker, anew after every half of them.
+
+    Parameters run along the principal axis of a piece.
+    """
+    if not len(marker):
+        return _no_pieces(marker, point_world[:, 0])
+    order = frame.argsort(stable=True)
+    order = order[marker[order].argsort(stable=True)]
+    size = torch.bincount(marker)
+    start = size.cumsum(0) - size
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(order), device=order.device) - start[marker[order]]
+    half = number // 2
+    # The last piece ends at the last point, however few are new.
+    count = ((size - number) / half).ceil().clamp_min(0).long() + 1
+    count = torch.where(size > 0, count, 0)
+    first = count.cumsum(0) - count
+    piece = torch.repeat_interleave(torch.arange(len(size), device=rank.device), count)
+    begin = (torch.arange(len(piece), device=rank.device) - first[piece]) * half
+    begin = torch.minimum(begin, (size[piece] - number).clamp_min(0))
+    back = torch.arange(4, device=rank.device)
+    latest = (rank / half).floor().long()
+    candidate = latest[:, None] - back + 1
+    valid = (candidate >= 0) & (candidate < count[marker, None])
+    at = (first[marker, None] + candidate).clamp(0, max(len(piece) - 1, 0))
+    ahead = rank[:, None] - begin[at]
+    point, which = (valid & (ahead >= 0) & (ahead < number)).nonzero(as_tuple=True)
+    of_piece = at[point, which]
+    control_count = torch.full_like(piece, control_points)
+    t = spline_fit.principal_parameter(point_world[point], of_piece, control_count)
+    return LanePieces(piece, control_count, of_piece, point, t)
+
+
+def fit_pieces(
+    pieces: LanePieces,
+    point_world: Float[Tensor, "p 3"],
+    sigma: Float[Tensor, " p"],
+    *,
+    smoothing: float,
+    scales: tuple[float, ...],
+    refine: bool = False,
+) -> LaneFit:
+    """Splines by iterated least squares (Tukey), all pieces at once.
+
+    `sigma` is the lateral noise expected of each point [m]; `scales` are factors on it, one an
+    iteration. `smoothing` is the price of bending in units of a piece's whole weight. `refine`
+    moves points once to the parameter nearest to them, which only pieces without a known parameter
+    need.
+    """
+    count, piece = pieces.control_count, pieces.piece
+    point, expected = point_world[pieces.point], sigma[pieces.point]
+    own = expected.square().reciprocal()
+    kept, t = torch.ones_like(own), pieces.t
+    base = _Basis(t, piece, count)
+    coefficient = base.solve(point, own, smoothing)
+    for step, scale in enumerate(scales):
+        if refine and step == len(scales) - 1:
+            control = spline_basis.from_coefficients_flat(coefficient, count)
+            t = spline_fit.closest_parameter_flat(control, count, point, piece)
+            base = _Basis(t, piece, count)
+        whitened = base.miss(coefficient, point) / expected
+        noise = _group_median(whitened.abs(), piece, len(count)) * 1.4826
+        gate = scale * noise.clamp(0.5, 4.0)[piece]
+        # Tukey alone would leave a piece whose points all disagree without any.
+        kept = Tukey().weight((whitened / gate).square()).clamp_min(1e-6)
+        coefficient = base.solve(point, own * kept, smoothing)
+    miss = base.miss(coefficient, point)
+    noise = _group_median((miss / expected).abs(), piece, len(count)) * 1.4826
+    return LaneFit(
+        control=spline_basis.from_coefficients_flat(coefficient, count),
+        sigma=base.control_sigma(own * kept) * noise.clamp_min(0.5)[spline_basis.rows(count)[0]],
+        miss=miss,
+        weight=kept,
+    )
+
+
+class _Basis:
+    """The B-splines of points at fixed parameters: what stays the same while weights change."""
+
+    def __init__(
+        self, t: Float[Tensor, " r"], piece: Int[Tensor, " r"], count: Int[Tensor, " n"]
+    ) -> None:
+        zero = torch.zeros_like(piece)
+        self.piece, self.count = piece, count
+        self.slot, self.w, self.dw = spline_basis.window_flat(t, zero, count[piece])
+        self.row = spline_basis.starts(count)[piece][:, None] + self.slot
+        self.longest = int(count.max()) if len(count) else 2
+        self.outer = (self.w[:, :, None] * self.w[:, None, :]).flatten(1)
+        cell = (piece[:, None, None] * self.longest + self.slot[:, :, None]) * self.longest
+        self.cell = (cell + self.slot[:, None, :]).flatten()
+
+    def normal(self, weight: Float[Tensor, " r"]) -> Float[Tensor, "n k k"]:
+        """Normal equations of each piece, padded to the longest."""
+        n, k = len(self.count), self.longest
+        flat = (weight[:, None] * self.outer).flatten()
+        return flat.new_zeros(n * k * k).index_add(0, self.cell, flat).reshape(n, k, k)
+
+    def solve(
+        self, point: Float[Tensor, "r 3"], weight: Float[Tensor, " r"], smoothing: float
+    ) -> Float[Tensor, "c 3"]:
+        """Coefficients of the weighted least squares fit."""
+        n, k = len(self.count), self.longest
+        total = group_sum(weight, self.piece, n).clamp_min(1e-12)
+        mean = group_sum(weight[:, None] * point, self.piece, n)
+        mean = mean / total[:, None]
+        A = self.normal(weight) / total[:, None, None]
+        # A trace of bending keeps coefficients that no point holds on the line of the others.
+        A = A + (smoothing + 1e-9) * spline_fit.bending(self.count, k, point)
+        unused = torch.arange(k, device=weight.device) >= self.count[:, None]
+        A = A + torch.diag_embed(torch.where(unused, 1.0, 1e-12).to(point))
+        pull = (weight[:, None] * self.w)[..., None] * (point - mean[self.piece])[:, None]
+        at = (self.piece[:, None] * k + self.slot).flatten()
+        rhs = point.new_zeros(n * k, 3).index_add(0, at, pull.flatten(0, 1)).reshape(n, k, 3)
+        solution = torch.linalg.solve(A, rhs / total[:, None, None])
+        of_row, rank = spline_basis.rows(self.count)
+        return solution[of_row, rank] + mean[of_row]
+
+    def miss(
+        self, coefficient: Float[Tensor, "c 3"], point: Float[Tensor, "r 3"]
+    ) -> Float[Tensor, " r"]:
+        """How far to the right of their pieces points are, in the top view [m]."""
+        around = coefficient[self.row][..., :2]
+        offset = point[:, :2] - (self.w[..., None] * around).sum(1)
+        tangent = torch.nn.functional.normalize((self.dw[..., None] * around).sum(1), dim=-1)
+        return offset[:, 0] * tangent[:, 1] - offset[:, 1] * tangent[:, 0]
+
+    def control_sigma(self, weight: Float[Tensor, " r"]) -> Float[Tensor, " c"]:
+        """Standard deviations of control points for points with these inverse variances."""
+        count, k = self.count, self.longest
+        # A control point that no point holds is unsure by metres, not by infinity.
+        inside = torch.arange(k, device=weight.device) < count[:, None]
+        A = self.normal(weight) + torch.diag_embed(torch.where(inside, 1 / 5.0**2, 1.0).to(weight))
+        covariance = torch.linalg.inv(A)
+        of_row, rank = spline_basis.rows(count)
+        # What takes coefficients to the point at a knot: 1/6, 4/6, 1/6, and 1 at the ends.
+        last = count[of_row] - 1
+        is_end = (rank == 0) | (rank == last)
+        near = torch.stack(((rank - 1).clamp_min(0), rank, torch.minimum(rank + 1, last)), dim=-1)
+        share = torch.where(is_end[:, None], weight.new_tensor([0.0, 1.0, 0.0]), 1 / 6)
+        share = share + torch.where(is_end[:, None], 0.0, weight.new_tensor([0.0, 0.5, 0.0]))
+        block = covariance[of_row[:, None, None], near[:, :, None], near[:, None, :]]
+        variance = (share[:, :, None] * block * share[:, None, :]).sum((1, 2))
+        return variance.clamp_min(0).sqrt()
+
+
+def _group_median(
+    value: Float[Tensor, " r"], group: Int[Tensor, " r"], count: int
+) -> Float[Tensor, " count"]:
+    order = value.argsort()
+    order = order[group[order].argsort(stable=True)]
+    number = torch.bincount(group, minlength=count)
+    middle = number.cumsum(0) - number + number // 2
+    at = order[middle.clamp_max(max(len(order) - 1, 0))] if len(order) else order
+    return value[at] if len(order) else value.new_zeros(count)
+
+
+def _no_pieces(marker: Tensor, like: Tensor) -> LanePieces:
+    none = marker[:0]
+    return LanePieces(none, none, none, none, like[:0])

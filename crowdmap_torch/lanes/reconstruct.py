@@ -1,0 +1,302 @@
+"""IV-D: lane tracklets of one journey -> overlapping pieces of markers as natural cubic splines, and what was pruned.
+
+`paper2017` maps every point to the plane under the car in its frame, and fits a spline to the most
+recent points again and again. Unlike the paper, `surface` lays the points on the road as the car
+drove it, weighs them by how far away they were seen, and cuts a marker into pieces of equal length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import distinct_pairs, group_mode, group_range, group_sum
+from crowdmap_torch.geometry import spline_basis, spline_length
+from crowdmap_torch.lanes.pieces import (
+    LaneFit,
+    LanePieces,
+    cut_by_length,
+    cut_by_number,
+    fit_pieces,
+)
+from crowdmap_torch.road.ground_projection import (
+    GroundPoints,
+    lateral_sigma,
+    project_to_planes,
+    project_to_surface,
+)
+from crowdmap_torch.tables import ControlPoints, Journey, Lanes, RoadEstimate, Tracklets
+
+METHODS = ("surface", "paper2017")
+REASONS = ("kept", "too few frames", "no points near enough", "too short", "too uncertain")
+"""What becomes of a tracklet, by code."""
+KEPT, FEW_FRAMES, NO_POINTS, SHORT, UNCERTAIN = range(len(REASONS))
+
+
+@dataclass(frozen=True)
+class PaperPieces:
+    """The pieces of the paper (IV-D)."""
+
+    recent_points: int = 200
+    """Points of a piece; a new piece begins after half of them."""
+    range_m: tuple[float, float] = (2.0, 45.0)
+    """Depth of the points that are used."""
+
+
+@dataclass(frozen=True)
+class LaneConfig:
+    """How lane tracklets become splines (IV-D)."""
+
+    method: str = "surface"
+    """`surface`: points on the road that the car drove; `paper2017`: points on one plane a frame,
+    most recent points."""
+    min_frames: int = 4
+    """Tracklets with fewer detections are pruned."""
+    min_length_m: float = 4.0
+    """Pieces that are shorter are pruned."""
+    min_points: int = 12
+    """Pieces with fewer points are pruned."""
+    max_sigma_m: float = 1.0
+    """Pieces whose control points are less sure, in the mean, are pruned."""
+    range_m: tuple[float, float] = (2.0, 25.0)
+    """Depth of the points that are used; method `surface`."""
+    piece_m: float = 40.0
+    """Length of a piece."""
+    overlap: float = 0.5
+    """Share of a piece that the next one covers too."""
+    control_points: int = 6
+    """Of a whole piece; shorter ones have fewer, at the same spacing."""
+    max_gap_m: float = 12.0
+    """A marker without points over a longer way ends, and begins again behind it: dashes are bridged,
+    intersections are not."""
+    noise_px: float = 1.0
+    """1-sigma of lane points."""
+    normal_sigma: float = 1.5e-3
+    """1-sigma of the normal's error that changes from frame to frame [rad]."""
+    drift: float = 0.01
+    """Drift of the car's reckoned way over one metre [m]; with the square root of the way."""
+    sigma_m: float = 0.04
+    """1-sigma of a piece's lateral error that its points share."""
+    height_sigma: float = 0.015
+    """1-sigma of the camera height, as a share of it: offsets are off by the same share."""
+    smoothing: float = 1e-4
+    """Price of bending, in units of a piece's whole weight."""
+    scales: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0)
+    """Factors on the noise in iterated least squares (Tukey), coarse to fine."""
+    confident_frames: float = 4.0
+    """Detections that a piece needs for its confidence to reach 1 - 1/e."""
+    paper: PaperPieces = field(default_factory=PaperPieces)
+    """Method `paper2017`."""
+
+    def __post_init__(self) -> None:
+        """Refuses unknown methods and pieces that do not overlap as they should."""
+        if self.method not in METHODS:
+            raise ValueError(f"method: expected one of {', '.join(METHODS)}, found {self.method!r}")
+        if not 0 <= self.overlap < 0.9:
+            raise ValueError(f"overlap: expected a share from 0 to below 0.9, found {self.overlap}")
+        if self.control_points < 2:
+            raise ValueError(f"control_points: expected two or more, found {self.control_points}")
+
+
+@dataclass(frozen=True)
+class LaneReport:
+    """What became of the lane tracklets of one journey."""
+
+    reason: Int[Tensor, " count"]
+    """Index into `REASONS` of every tracklet."""
+    points: int
+    """Points of the pieces kept; those in two pieces count twice."""
+    outliers: int
+    """Those of them that the splines left out."""
+    rms_m: float
+    """Of the lateral misses of the others."""
+
+    @property
+    def pruned(self) -> dict[str, int]:
+        """Tracklets by reason, those kept included."""
+        counts = torch.bincount(self.reason, minlength=len(REASONS)).tolist()
+        return dict(zip(REASONS, counts, strict=True))
+
+
+@torch.no_grad()
+def reconstruct_lanes(
+    journey: Journey, tracklets: Tracklets, road: RoadEstimate, config: LaneConfig
+) -> tuple[Lanes, LaneReport]:
+    """The lane pieces that a journey's tracklets show (the paper's O2), and what was pruned."""
+    label = tracklets.label
+    frames = torch.bincount(label[label >= 0], minlength=tracklets.count)
+    reason = torch.where(frames < config.min_frames, FEW_FRAMES, NO_POINTS)
+    is_long = torch.nn.functional.pad(reason == NO_POINTS, (0, 1))  # the last one for no tracklet
+    is_paper = config.method == "paper2017"
+    ground = (project_to_planes if is_paper else project_to_surface)(journey, road)
+    near, far = config.paper.range_m if is_paper else config.range_m
+    detection = journey.lane_points.detection
+    used = is_long[label[detection]] & ground.is_on_ground
+    rows = (used & (ground.depth > near) & (ground.depth < far)).nonzero()[:, 0]
+    ground, detection = ground[rows], detection[rows]
+    frame, marker = journey.lanes.frame[detection], label[detection]
+    pieces, sigma = _cut(journey, ground, frame, marker, road, config)
+    pieces = pieces.select(torch.bincount(pieces.piece, minlength=len(pieces)) >= config.min_points)
+    fit = fit_pieces(
+        pieces,
+        ground.point_world,
+        sigma,
+        smoothing=config.smoothing,
+        scales=config.scales,
+        refine=is_paper,
+    )
+    sigma = _control_sigma(ground, pieces, fit, config)
+    reason, kept = _judged(pieces, fit, sigma, reason, config)
+    lanes = _table(journey, detection, pieces, fit, sigma, config)
+    miss = fit.miss[kept[pieces.piece] & (fit.weight > 0.1)]
+    points = int(kept[pieces.piece].sum())
+    report = LaneReport(
+        reason=reason,
+        points=points,
+        outliers=points - len(miss),
+        rms_m=float(miss.square().mean().sqrt()) if len(miss) else 0.0,
+    )
+    return lanes.select(kept.nonzero()[:, 0]), report
+
+
+def _cut(
+    journey: Journey,
+    ground: GroundPoints,
+    frame: Int[Tensor, " p"],
+    marker: Int[Tensor, " p"],
+    road: RoadEstimate,
+    config: LaneConfig,
+) -> tuple[LanePieces, Float[Tensor, " p"]]:
+    """Pieces of markers, and the lateral noise expected of each point [m]; the paper's are all equally sure."""
+    if config.method == "paper2017":
+        pieces = cut_by_number(
+            marker,
+            frame,
+            ground.point_world,
+            number=config.paper.recent_points,
+            control_points=config.control_points,
+        )
+        return pieces, torch.full_like(ground.depth, 0.2)
+    pieces = cut_by_length(
+        marker,
+        _along(ground, marker),
+        max_gap=config.max_gap_m,
+        length=config.piece_m,
+        overlap=config.overlap,
+        control_points=config.control_points,
+    )
+    sigma = lateral_sigma(
+        ground,
+        frame,
+        road,
+        sigma_ideal=config.noise_px / _focal(journey),
+        normal_sigma=config.normal_sigma,
+        drift=config.drift,
+    )
+    return pieces, sigma
+
+
+def _along(ground: GroundPoints, marker: Int[Tensor, " p"]) -> Float[Tensor, " p"]:
+    """Where points are along their marker [m]: the car's way, or across it for markers that cross the road."""
+    if not len(marker):
+        return ground.station
+    count = int(marker.max()) + 1
+    number = torch.bincount(marker, minlength=count).clamp_min(1)
+
+    def spread(value: Tensor) -> Tensor:
+        mean = value.new_zeros(count).index_add(0, marker, value) / number
+        return value.new_zeros(count).index_add(0, marker, (value - mean[marker]).square())
+
+    crosses = spread(ground.offset) > spread(ground.station)
+    return torch.where(crosses[marker], ground.offset, ground.station)
+
+
+def _control_sigma(
+    ground: GroundPoints, pieces: LanePieces, fit: LaneFit, config: LaneConfig
+) -> Float[Tensor, " c"]:
+    """1-sigma of control points, with what all points of a piece share [m]."""
+    offset = group_sum(ground.offset[pieces.point].abs(), pieces.piece, len(pieces))
+    offset = offset / torch.bincount(pieces.piece, minlength=len(pieces)).clamp_min(1)
+    of_piece = config.sigma_m**2 + (config.height_sigma * offset).square()
+    return (fit.sigma.square() + of_piece[spline_basis.rows(pieces.control_count)[0]]).sqrt()
+
+
+def _judged(
+    pieces: LanePieces,
+    fit: LaneFit,
+    sigma: Float[Tensor, " c"],
+    reason: Int[Tensor, " count"],
+    config: LaneConfig,
+) -> tuple[Int[Tensor, " count"], Bool[Tensor, " n"]]:
+    """What becomes of every tracklet, and which pieces are kept."""
+    count = pieces.control_count
+    length = spline_length.arc_length_flat(fit.control, count)
+    is_sure = (
+        group_sum(sigma, spline_basis.rows(count)[0], len(pieces)) / count < config.max_sigma_m
+    )
+    kept = is_sure & (length >= config.min_length_m)
+    for code, pieces_so in (
+        (UNCERTAIN, ~is_sure),
+        (SHORT, is_sure & (length < config.min_length_m)),
+        (KEPT, kept),
+    ):
+        reason = reason.index_fill(0, pieces.marker[pieces_so], code)
+    return reason, kept
+
+
+def _table(
+    journey: Journey,
+    detection: Int[Tensor, " p"],
+    pieces: LanePieces,
+    fit: LaneFit,
+    sigma: Float[Tensor, " c"],
+    config: LaneConfig,
+) -> Lanes:
+    """The pieces as lanes, with what is known of them; `detection` is that of each point."""
+    n, count = len(pieces), pieces.control_count
+    frame = journey.lanes.frame[detection[pieces.point]]
+    first, last = group_range(frame, pieces.piece, n)
+    of_piece, sighting, _ = distinct_pairs(pieces.piece, detection[pieces.point])
+    observations = torch.bincount(of_piece, minlength=n)
+    inliers = group_sum((fit.weight > 0.1).to(fit.weight), pieces.piece, n)
+    share = inliers / torch.bincount(pieces.piece, minlength=n).clamp_min(1)
+    kind = journey.lanes.type[sighting]
+    order = _forward(journey, fit.control, count, first, last)
+    return Lanes(
+        type=group_mode(kind, fit.weight.new_ones(len(kind)), of_piece, n),
+        control_start=spline_basis.starts(count),
+        control_count=count,
+        journey=torch.zeros_like(first),
+        tracklet=pieces.marker,
+        frame=(first + last) // 2,
+        n_journeys=torch.ones_like(first),
+        n_observations=observations,
+        first_seen_ns=journey.t_ns[first],
+        last_seen_ns=journey.t_ns[last],
+        confidence=share * (1 - torch.exp(-observations / config.confident_frames)),
+        control=ControlPoints(fit.control, sigma)[order],
+    )
+
+
+def _forward(
+    journey: Journey,
+    control: Float[Tensor, "c 3"],
+    count: Int[Tensor, " n"],
+    first: Int[Tensor, " n"],
+    last: Int[Tensor, " n"],
+) -> Int[Tensor, " c"]:
+    """Order of the control points in which every piece runs as the car went."""
+    start = spline_basis.starts(count)
+    way = control[start + count - 1] - control[start]
+    ahead = journey.T_world_camera[first, :3, 2] + journey.T_world_camera[last, :3, 2]
+    runs_back = (way * ahead).sum(-1) < 0
+    piece, rank = spline_basis.rows(count)
+    return start[piece] + torch.where(runs_back[piece], count[piece] - 1 - rank, rank)
+
+
+def _focal(journey: Journey) -> float:
+    K = journey.rig.camera.K
+    return (K[0, 0] * K[1, 1]).sqrt().item()

@@ -1,0 +1,1 @@
+"""What sensors get wrong: poses and pixels."""

@@ -1,0 +1,125 @@
+"""Noise of detections: what it is taken to be, and how large an adjustment's residuals show it; outliers do not matter.
+
+The error of a pose hits all corners of a detection alike: it moves the sign in the image and leaves its outline. So one
+detection is one observation, and its covariance is that of pixel noise of the corners and of the pose that they share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.geometry import polygon
+from crowdmap_torch.optim.robust import median_scale
+
+_CLASSES = 8
+"""Classes of boxes of about equal numbers, by size."""
+
+
+@dataclass(frozen=True)
+class PixelNoiseConfig:
+    """Noise of the corners of detections."""
+
+    sigma_px: float = 0.6
+    """Noise of each corner of a large detection, per axis [px]."""
+    small_box_px: float = 12.0
+    """Box at which that noise has grown by a factor of 1.41 [px]."""
+    box_sigma: float = 0.5
+    """Noise of width and height of detections that are axis-aligned boxes, as a share: boxes are drawn around a sign, wider
+    than its outline where it is seen at an angle."""
+
+
+@dataclass(frozen=True)
+class DetectionNoise:
+    """What is known of the noise of every detection; of a shape with C corners the leading 2 C entries count."""
+
+    whitening: Float[Tensor, "m 16 16"]
+    """Inverse Cholesky factor of the covariance; being triangular, its leading part is a factor of its own."""
+    by_pose: Float[Tensor, "m 16 6"]
+    """Derivative of the pixel errors by the detection's pose."""
+    pose_variance: Float[Tensor, "m 6"]
+    pose_error: Float[Tensor, "m 6"]
+    """The detection's own pose error as far as it is known; `by_pose` is taken there."""
+
+    def likely_pose_error(self, whitened: Float[Tensor, "m 16"]) -> Float[Tensor, "m 6"]:
+        """The most likely error of each detection's pose, given what is left of its pixel errors."""
+        by_pose = self.whitening @ self.by_pose
+        # The error is predicted minus observed: a camera that is off by d makes it by_pose d larger, and is corrected
+        # by -d.
+        return -self.pose_variance * (by_pose.mT @ whitened[..., None])[..., 0]
+
+
+def detection_noise(
+    corners_px: Float[Tensor, "m 8 2"],
+    factor: Float[Tensor, " m"],
+    by_pose: Float[Tensor, "m 16 6"],
+    pose_variance: Float[Tensor, "m 6"],
+    pose_error: Float[Tensor, "m 6"],
+    config: PixelNoiseConfig,
+) -> DetectionNoise:
+    """The noise of detections whose pixels are noisier by `factor` than usual, and whose poses have such a variance."""
+    box = (corners_px.amax(1) - corners_px.amin(1)).amax(-1)
+    pixel = config.sigma_px**2 * (1 + (config.small_box_px / box).square())
+    covariance = (by_pose * pose_variance[:, None]) @ by_pose.mT
+    covariance.diagonal(dim1=-2, dim2=-1).add_((pixel * factor.square())[:, None])
+    by_scale = box_scales(corners_px) * config.box_sigma
+    covariance = covariance + by_scale @ by_scale.mT
+    lower = torch.linalg.cholesky(covariance)
+    eye = torch.eye(lower.shape[-1], dtype=lower.dtype, device=lower.device)
+    whitening = torch.linalg.solve_triangular(lower, eye.expand_as(lower), upper=False)
+    return DetectionNoise(whitening, by_pose, pose_variance, pose_error)
+
+
+def box_scales(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, "m 16 2"]:
+    """Derivatives of the corners by the logarithms of the box's width and height; zero for outlines that are no boxes."""
+    low, high = corners_px.amin(1, keepdim=True), corners_px.amax(1, keepdim=True)
+    offset = (corners_px - (low + high) / 2) * polygon.is_box(corners_px)[:, None, None]
+    return torch.diag_embed(offset).flatten(1, 2)
+
+
+@dataclass(frozen=True)
+class BoxNoise:
+    """Standard deviation of corners by the size of their box: `large_px * sqrt(1 + (small_box_px / box)^2)`."""
+
+    large_px: Float[Tensor, ""]
+    small_box_px: Float[Tensor, ""]
+
+
+def noise_by_box(length: Float[Tensor, " m"], box_px: Float[Tensor, " m"]) -> BoxNoise:
+    """The noise of corners whose residuals have these lengths, in units of their median's expectation.
+
+    The median of every class of boxes is one observation of the variance, and least squares with neither part below
+    zero fit the two: small boxes may be as good as large ones, but not better.
+    """
+    order = torch.argsort(box_px, stable=True)
+    parts = [part for part in order.tensor_split(_CLASSES) if len(part)]
+    variance = torch.stack([length[part].median().square() for part in parts])
+    inverse = torch.stack([box_px[part].median() for part in parts]).pow(-2)
+    # A relative error of the variance is about the same in every class.
+    A = torch.stack((torch.ones_like(inverse), inverse), dim=1) / variance[:, None].clamp_min(1e-12)
+    whole = torch.stack((variance.mean(), torch.zeros_like(variance[0])))
+    fit = torch.linalg.lstsq(A, torch.ones_like(variance)).solution if len(parts) > 1 else whole
+    large, small = torch.where((fit > 0).all(), fit, whole)
+    return BoxNoise(large.sqrt(), (small / large.clamp_min(1e-12)).sqrt())
+
+
+def shared_error(
+    residual: Float[Tensor, " m"], frame: Int[Tensor, " m"], detection: Int[Tensor, " m"]
+) -> Float[Tensor, ""]:
+    """Factor by which sums over the points of a detection scatter more than if the points erred one by one.
+
+    `detection` is counted by journey, `frame` over all journeys.
+    """
+    if not len(residual):
+        return residual.new_tensor(1.0)
+    key = frame * (int(detection.max()) + 1) + detection
+    _, group = torch.unique(key, return_inverse=True)
+    count = torch.bincount(group)
+    total = residual.new_zeros(len(count)).index_add_(0, group, residual)
+    several = count > 1
+    if not bool(several.any()):
+        return residual.new_tensor(1.0)
+    return median_scale(total[several] / count[several].sqrt()) / median_scale(residual, floor=1e-9)

@@ -1,0 +1,85 @@
+"""What detections say beside what everything else foresees of them: the test that leverage does not fool.
+
+A detection that no other confirms draws its frame's pose to itself, and then its residual says nothing. Its innovation
+does: the residual as it would be had it not been made, measured by its own covariance, which that of the pose is a part
+of.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.stats import chi2
+from torch import Tensor
+
+from crowdmap_torch.optim.linearize import chunks, row_blocks
+from crowdmap_torch.optim.problem import CostTerm, Values, Variable
+from crowdmap_torch.optim.robust import JointTukey, Quadratic
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Of every detection."""
+
+    squared: Float[Tensor, " n"]
+    """Normalised by its covariance (NIS; Bar-Shalom, Li and Kirubarajan 2001, 5.4): at normal noise chi-squared."""
+    freedom: Int[Tensor, " n"]
+    """Numbers that the detection consists of."""
+    weight: Float[Tensor, " n"]
+    """The robust weight that it has."""
+
+    def are_too_large(self, probability: float) -> Bool[Tensor, " n"]:
+        """True where normal noise passes the innovation with less than this probability.
+
+        The noise is scaled to what the detections that have a say show in their median, where that is more than it should.
+        """
+        kinds = self.freedom.unique()
+        median, bound = self.squared.new_zeros(2, int(kinds.max()) + 1 if len(kinds) else 1)
+        median[kinds] = median.new_tensor(chi2.median(kinds.cpu().numpy()))
+        bound[kinds] = bound.new_tensor(chi2.isf(probability, kinds.cpu().numpy()))
+        usual = (self.squared / median[self.freedom])[self.weight > 0]
+        scale = usual.median().clamp_min(1.0) if len(usual) else median.new_tensor(1.0)
+        return self.squared > scale * bound[self.freedom]
+
+
+def innovations(
+    term: CostTerm,
+    variables: dict[str, Variable],
+    values: Values,
+    covariance: Float[Tensor, "p k k"],
+) -> Innovations:
+    """The innovations of the detections of a term whose loss is theirs as a whole.
+
+    `values` are the minimum, and `covariance` is there that of the blocks of the term's first slot, of which the rows of
+    a detection touch one and the same, with all else known.
+    """
+    loss = term.loss
+    assert isinstance(loss, JointTukey)
+    run = loss.run
+    count = torch.bincount(run)
+    n, k = len(count), covariance.shape[-1]
+    s = covariance.new_zeros(len(run))
+    gradient = covariance.new_zeros(n, k)
+    matrix = covariance.new_zeros(n, k * k)
+    for at, piece in chunks(replace(term, loss=Quadratic())):
+        blocks = row_blocks(piece, variables, values)
+        s[at] = blocks.rho
+        gradient.index_add_(0, run[at], blocks.gradient[0].mT)
+        matrix.index_add_(0, run[at], blocks.hessian[0, 0].flatten(0, 1).mT)
+    square = s.new_zeros(n).index_add_(0, run, s)
+    first = count.cumsum(0) - count
+    weight, block = loss.weight(s)[first], term.slots[0][1][first]
+    matrix, gradient = matrix.view(n, k, k), gradient[..., None]
+    counted = weight[:, None, None]
+    # Without its rows the block moves along them, and the residual with it. A block without a covariance has no
+    # innovation either, and nothing is held against it.
+    without = torch.linalg.inv_ex(covariance[block]).inverse - counted * matrix
+    step = torch.linalg.solve_ex(without, counted * gradient).result
+    change = matrix @ step
+    square = square + (step * (2 * gradient + change))[..., 0].sum(-1)
+    gradient = gradient + change
+    # The residual's covariance is one and what the block adds; its inverse by Woodbury's identity.
+    own = (gradient * torch.linalg.solve_ex(without + matrix, gradient).result)[..., 0].sum(-1)
+    return Innovations(square - own, loss.row_dim * count, weight)

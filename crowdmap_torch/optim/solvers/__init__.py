@@ -1,0 +1,1 @@
+"""Ways to solve the damped normal equations, each by what it eliminates."""

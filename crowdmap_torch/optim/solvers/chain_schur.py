@@ -1,0 +1,381 @@
+"""The back end for chains: leaves and chains are eliminated round by round, the landmarks are one small dense system.
+
+Bundle adjustment of a map has frames by the ten thousand, each bound to the next, and landmarks by the hundred: what is
+eliminated are the frames, the reverse of the usual habit. With D in A and C already, the normal equations and what is left
+of them are
+
+    [ A  B^T ] [ x ]     [ a ]        A: `diagonal`, `link`    B: `coupling`    C: `hessian`
+    [ B  C   ] [ y ] = - [ b ]        a: `eliminated_gradient`                  b: `gradient`
+
+    S = C - B A^-1 B^T        S y = -(b - B A^-1 a)        x = -A^-1 (a + B^T y)
+
+the Schur complement on the landmarks, the reduced system and the back-substitution. `elimination` says in which order,
+`chain_sums` adds the blocks up, `block_elimination` is the arithmetic of a round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
+from crowdmap_torch.optim.problem import Problem, Values
+from crowdmap_torch.optim.solvers.assembly import Costs, assemble
+from crowdmap_torch.optim.solvers.block_elimination import Lead, eliminate, fill_chain, rows_of
+from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
+from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
+from crowdmap_torch.optim.solvers.layout import Layout, SparsityPattern, read_entries
+from crowdmap_torch.optim.solvers.normal_equations import (
+    DIAGONAL_FLOOR,
+    LinearFunctions,
+    Step,
+    StepPart,
+    Tangents,
+    failed_step,
+    solved_step,
+)
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
+from crowdmap_torch.optim.solvers.windows import Batch
+from crowdmap_torch.optim.threads import in_order
+
+UNOBSERVED_FLOOR = 1e-9
+"""Information added to every landmark before its covariance is read: none that nothing observes spoils the others."""
+
+
+@dataclass
+class ChainBackend:
+    """Normal equations of one problem, leaves and chains eliminated as planned.
+
+    The order of elimination is worked out when a problem is first seen, and kept for problems whose terms touch the same
+    blocks: weights, constants and losses may change from step to step.
+    """
+
+    plan: EliminationPlan
+    group_size: int | None = None
+    """Blocks that share one window of columns; None: as many as there are chains, from 4 to 64."""
+    batch_bytes: int = 1 << 22
+    """Size of what is computed at once: about what the processor's cache holds."""
+    chunk_rows: int = CHUNK_ROWS
+    _pattern: SparsityPattern | None = field(default=None, repr=False)
+    _structure: ChainStructure | None = field(default=None, repr=False)
+    _workspace: Workspace | None = field(default=None, repr=False)
+
+    def assemble(self, problem: Problem, values: Values) -> ChainNormalEquations:
+        """Normal equations at `values`; memory beyond them is bounded by the chunk.
+
+        The workspace of the solve is the back end's: of its normal equations only the last may be solved.
+        """
+        if self.plan.border is not None:
+            raise ValueError(f"the border {self.plan.border!r} is for BorderedBackend to eliminate")
+        return self.assemble_with_border(problem, values)[0]
+
+    def assemble_with_border(
+        self, problem: Problem, values: Values
+    ) -> tuple[ChainNormalEquations, ReducibleSums]:
+        """The same, and the sums that they were made of, the border's blocks among them."""
+        structure, workspace = self.prepare(problem, values)
+        coupling = {
+            name: workspace.coupling(name, coupling.column.shape)
+            for name, coupling in structure.couplings.items()
+        }
+        sums = ReducibleSums(structure, problem, values, coupling)
+        order = {name: coupling.order for name, coupling in structure.couplings.items()}
+        costs = assemble(
+            problem, values, row_blocks, sums.add, order=order, chunk_rows=self.chunk_rows
+        )
+        return _equations(costs, sums, workspace), sums
+
+    def prepare(self, problem: Problem, values: Values) -> tuple[ChainStructure, Workspace]:
+        """The structure of such a problem and the memory for it, unless both are there already."""
+        if self._pattern is None or not self._pattern.is_of(problem, values):
+            if problem.group_count != 1:
+                raise ValueError("chains are eliminated in one problem at a time, not in a batch")
+            self._structure = analyse(
+                problem, values, self.plan, group_size=self.group_size, batch_bytes=self.batch_bytes
+            )
+            block = values[self.plan.chains]
+            k = problem.variables[self.plan.chains].tangent_dim
+            self._workspace = Workspace(block.new_empty(self._structure.store_rows + 1, k))
+            self._pattern = SparsityPattern.of(problem, values)
+        assert self._structure is not None and self._workspace is not None
+        return self._structure, self._workspace
+
+
+@dataclass
+class Workspace:
+    """What the solves of one back end share: memory is taken once."""
+
+    store: Float[Tensor, "rows k"]
+    """Per eliminated block and column of its window a row of `k`; once eliminated, whitened by its diagonal."""
+    couplings: dict[str, Float[Tensor, "f w k"]] = field(default_factory=dict)
+    """Of the last normal equations, by term."""
+    factor: Factor | None = None
+    """Of the last solve."""
+
+    def coupling(self, name: str, shape: torch.Size) -> Float[Tensor, "f w k"]:
+        """Memory for a term's coupling; what is in it is of no account."""
+        if name not in self.couplings:
+            self.couplings[name] = self.store.new_empty(*shape, self.store.shape[1])
+        return self.couplings[name]
+
+
+@dataclass(frozen=True)
+class Factor:
+    """The factorised matrix, together with the store."""
+
+    leads: list[Lead]
+    """By batch."""
+    reduced: Float[Tensor, "r r"]
+    """Cholesky factor of S, the upper one."""
+
+
+@dataclass(frozen=True)
+class ChainNormalEquations:
+    """The quadratic model by blocks; the letters are the module's."""
+
+    cost: Float[Tensor, " 1"]
+    term_cost: Mapping[str, Float[Tensor, " 1"]]
+    structure: ChainStructure
+    diagonal: Float[Tensor, "e k k"]
+    link: Float[Tensor, "e k k"]
+    """Block of each node with its successor, of each leaf with the block that carries it."""
+    eliminated_gradient: Float[Tensor, "e k"]
+    coupling: Mapping[str, Float[Tensor, "f w k"]]
+    hessian: Float[Tensor, "r r"]
+    gradient: Float[Tensor, " r"]
+    workspace: Workspace = field(repr=False)
+
+    def solve(self, damping: Float[Tensor, " 1"]) -> Step:
+        """The damped step: eliminate round by round, solve what is left, substitute back."""
+        added_x, added_y = self.damped_by(damping)
+        right_side = self.factorise(added_x, added_y)
+        if right_side is None:
+            return failed_step(self.unpack(self.eliminated_gradient, self.gradient), self.cost)
+        y = -self.solve_reduced(right_side[:, None])[:, 0]
+        x = self._substitute(y)
+        return solved_step(self.unpack(x, y), *self.step_parts(x, y, added_x, added_y))
+
+    def damped_by(
+        self, damping: Float[Tensor, " 1"]
+    ) -> tuple[Float[Tensor, "e k"], Float[Tensor, " r"]]:
+        """What damping adds to the diagonals of A and C."""
+        of_A = self.diagonal.diagonal(dim1=-2, dim2=-1)
+        of_C = self.hessian.diagonal()
+        return damping * of_A.clamp_min(DIAGONAL_FLOOR), damping * of_C.clamp_min(DIAGONAL_FLOOR)
+
+    def step_parts(
+        self,
+        x: Float[Tensor, "e k"],
+        y: Float[Tensor, " r"],
+        added_x: Float[Tensor, "e k"],
+        added_y: Float[Tensor, " r"],
+    ) -> tuple[StepPart, StepPart]:
+        """The parts of a step of the eliminated blocks and of the landmarks."""
+        return (
+            StepPart(x[None], self.eliminated_gradient[None], added_x[None]),
+            StepPart(y[None], self.gradient[None], added_y[None]),
+        )
+
+    def unpack(self, x: Float[Tensor, "e k ..."], y: Float[Tensor, "r ..."]) -> dict[str, Tensor]:
+        """Tangents by variable."""
+        return {**self.structure.where.unpack(y[None]), **self.structure.unstack(x)}
+
+    def covariance(self, *, floor: float = UNOBSERVED_FLOOR) -> LandmarkCovariance:
+        """The joint covariance of all landmarks, the eliminated blocks marginalised: the inverse of S, undamped."""
+        nothing = torch.zeros_like(self.eliminated_gradient)
+        if self.factorise(nothing, torch.full_like(self.gradient, floor)) is None:
+            raise ValueError("the chains' blocks are not positive definite without damping")
+        assert self.workspace.factor is not None
+        matrix = torch.cholesky_inverse(self.workspace.factor.reduced, upper=True)
+        return LandmarkCovariance(matrix, self.structure.where)
+
+    def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
+        """Covariance of every block of an eliminated variable, the landmarks known."""
+        found = diagonal_of_inverse(self.structure, self.diagonal, self.link)
+        return self.structure.unstack(found)[name]
+
+    def factorise(
+        self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"]
+    ) -> Float[Tensor, " r"] | None:
+        """The right-hand side b - B A^-1 a of the reduced system, which is factorised; None: it is not positive definite.
+
+        The arguments are added to the diagonals of A and C. Of S only the upper triangle counts. The eliminated rows are
+        in the store.
+        """
+        structure, store = self.structure, self.workspace.store
+        store.zero_()
+        for name, block in self.coupling.items():
+            store.index_add_(0, structure.factor_rows[name], block.flatten(0, 1))
+        store[structure.right_side_row] = self.eliminated_gradient
+        dim = len(self.gradient)
+        # One row and column more for the right-hand side, one for padding.
+        system = torch.nn.functional.pad(self.hessian + torch.diag(added_y), (0, 2, 0, 2))
+        system[dim, :dim] = self.gradient
+        diagonal, link = structure.by_place(self.diagonal + torch.diag_embed(added_x), self.link)
+        leads = []
+        for of_round in structure.rounds:
+            parts = in_order(
+                lambda batch: eliminate(batch, diagonal, link, store, len(system)),
+                of_round,
+                store.device,
+            )
+            for batch, part in zip(of_round, parts, strict=True):
+                leads.append(part.lead)
+                fill_chain(batch, part.lead.square, diagonal, link)
+                system.view(-1).index_add_(0, part.at, part.product)
+                store.index_add_(0, batch.fill.flatten(), part.fill)
+        S = system[:dim, :dim]
+        # What is not positive definite on the way gives numbers that are not finite.
+        reduced, failed = torch.linalg.cholesky_ex(S, upper=True)
+        if bool(failed) or not bool(S.isfinite().all()):
+            return None
+        self.workspace.factor = Factor(leads, reduced)
+        return system[dim, :dim]
+
+    def solve_reduced(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
+        """S^-1 of right-hand sides, by the last factors."""
+        assert self.workspace.factor is not None
+        return torch.cholesky_solve(right_side, self.workspace.factor.reduced, upper=True)
+
+    def solve_eliminated(self, right_side: Float[Tensor, "e k c"]) -> Float[Tensor, "e k c"]:
+        """A^-1 of right-hand sides, by the last factors.
+
+        Chains do not touch each other in A: one column serves as many right-hand sides as there are chains.
+        """
+        structure, factor = self.structure, self.workspace.factor
+        assert factor is not None
+        rest = right_side.new_zeros(len(structure.order), *right_side.shape[1:])
+        rest[structure.place] = right_side
+        solution = torch.zeros_like(rest)
+        steps = list(zip(structure.batches, factor.leads, strict=True))
+        for batch, lead in steps:
+            fill = (lead.towards.mT @ rest[batch.place]).view(-1, *right_side.shape[1:])
+            rest.index_add_(0, batch.neighbour.flatten(), fill)
+        for batch, lead in reversed(steps):
+            beside = solution[batch.neighbour].flatten(1, 2)
+            own = lead.whiten.mT @ (lead.whiten @ rest[batch.place])
+            solution[batch.place] = own + lead.towards @ beside
+        return solution[structure.place]
+
+    def solve_again(self, gradient: Tangents) -> dict[str, Tensor]:
+        """The step for another gradient by the last factors, whatever the damping they were made with."""
+        a = torch.cat([gradient[name] for name in self.structure.plan.first_block])[..., None]
+        x = self.solve_eliminated(a)
+        one = torch.zeros_like(self.structure.owner)
+        b = self.structure.where.pack(gradient)[0]
+        y = self.solve_reduced(self.couple(x, one, 1)[..., 0] - b[:, None])[:, 0]
+        x = x + self.solve_eliminated(self.couple_back(y)[..., None])
+        return self.unpack(-x[..., 0], y)
+
+    def couple(
+        self, x: Float[Tensor, "e k c"], column: Int[Tensor, " e"], columns: int
+    ) -> Float[Tensor, "r columns c"]:
+        """B x, the products of the eliminated blocks added up in a column of the result each."""
+        total = x.new_zeros(len(self.gradient) * columns, x.shape[-1])
+        for name, block in self.coupling.items():
+            coupling = self.structure.couplings[name]
+            for at in range(0, len(block), CHUNK_ROWS):
+                here = slice(at, at + CHUNK_ROWS)
+                of = coupling.block[here]
+                entry = coupling.column[here] * columns + column[of][:, None]
+                total.index_add_(0, entry.flatten(), (block[here] @ x[of]).flatten(0, 1))
+        return total.view(-1, columns, x.shape[-1])
+
+    def couple_back(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
+        """B^T y."""
+        total = torch.zeros_like(self.eliminated_gradient)
+        for name, block in self.coupling.items():
+            coupling = self.structure.couplings[name]
+            product = (y[coupling.column][:, None] @ block)[:, 0]
+            total.index_add_(0, coupling.block, product)
+        return total
+
+    def _substitute(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
+        """The steps of the eliminated blocks, from the last round to the first, out of the store."""
+        structure, factor, store = self.structure, self.workspace.factor, self.workspace.store
+        assert factor is not None
+        # The right-hand side's column counts once, padding not at all.
+        known = torch.cat((y, y.new_tensor([1.0, 0.0])))
+        x = y.new_zeros(len(structure.order), store.shape[1])
+
+        def substitute(item: tuple[Batch, Lead]) -> Float[Tensor, "e k"]:
+            batch, lead = item
+            window = known[batch.columns].repeat_interleave(batch.fill.shape[1], 0)[:, None]
+            own = (window @ rows_of(batch, store)).mT
+            beside = x[batch.neighbour].flatten(1)[..., None]
+            return (lead.towards @ beside - lead.whiten.mT @ own)[..., 0]
+
+        last = len(factor.leads)
+        for of_round in reversed(structure.rounds):
+            mine = slice(last - len(of_round), last)
+            last = mine.start
+            items = list(zip(of_round, factor.leads[mine], strict=True))
+            parts = in_order(substitute, items, x.device)
+            for batch, part in zip(of_round, parts, strict=True):
+                x[batch.place] = part
+        return x[structure.place]
+
+
+@dataclass(frozen=True)
+class LandmarkCovariance:
+    """The joint covariance of all landmarks, as one dense matrix."""
+
+    matrix: Float[Tensor, "r r"]
+    where: Layout
+
+    def of(self, functions: LinearFunctions) -> Float[Tensor, "n m m"]:
+        """Covariance of each row's functions of landmarks."""
+        at, J = read_entries(functions, self.where)
+        return J @ self.matrix[at[:, :, None], at[:, None]] @ J.mT
+
+    def common(self, functions: LinearFunctions) -> Float[Tensor, "m m"]:
+        """The largest covariance that can be taken off all rows together, so that what is left is a covariance."""
+        at, J = read_entries(functions, self.where)
+        joint = self.matrix[at[:, None, :, None], at[None, :, None]]
+        joint = (J[:, None] @ joint @ J[None].mT).transpose(1, 2).flatten(2).flatten(0, 1)
+        factor = torch.linalg.cholesky(joint)
+        alike = torch.eye(J.shape[1]).to(factor).repeat(len(at), 1)
+        return torch.linalg.inv(alike.mT @ torch.cholesky_solve(alike, factor))
+
+
+def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> ChainNormalEquations:
+    return ChainNormalEquations(
+        cost=costs.total,
+        term_cost=costs.by_term,
+        structure=sums.structure,
+        diagonal=sums.diagonal(),
+        link=sums.link,
+        eliminated_gradient=sums.gradient(),
+        coupling=sums.coupling,
+        hessian=sums.landmark_hessian(),
+        gradient=sums.landmark_gradient(),
+        workspace=workspace,
+    )
+
+
+def chain_equations(
+    structure: ChainStructure,
+    diagonal: Float[Tensor, "e k k"],
+    link: Float[Tensor, "e k k"],
+    gradient: Float[Tensor, "e k"],
+) -> ChainNormalEquations:
+    """Normal equations of chains and leaves alone, from their blocks; `structure` knows of no landmarks."""
+    nothing = gradient.new_zeros(0)
+    store = gradient.new_empty(structure.store_rows + 1, gradient.shape[1])
+    return ChainNormalEquations(
+        cost=gradient.new_zeros(1),
+        term_cost={},
+        structure=structure,
+        diagonal=diagonal,
+        link=link,
+        eliminated_gradient=gradient,
+        coupling={},
+        hessian=nothing.view(0, 0),
+        gradient=nothing,
+        workspace=Workspace(store),
+    )

@@ -1,0 +1,140 @@
+"""Where the blocks of rows go in the normal equations of chains: the sums A, B, C of `elimination`, and the border's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.optim.linearize import RowBlocks
+from crowdmap_torch.optim.problem import Problem, Values
+from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, add_blocks, pairs
+from crowdmap_torch.optim.solvers.elimination import ChainStructure, Coupling
+
+
+class ChainSums:
+    """The blocks of leaves and chains, between these and the border, and every variable's diagonal."""
+
+    def __init__(self, structure: ChainStructure, problem: Problem, values: Values) -> None:
+        plan = structure.plan
+        like, k = values[plan.chains], problem.variables[plan.chains].tangent_dim
+        b = 0 if plan.border is None else problem.variables[plan.border].tangent_dim
+        self.structure = structure
+        self.by_variable = BlockDiagonal(problem, values)
+        self.link = like.new_zeros(len(structure.owner), k, k)
+        """Block of A of each chain's block with its successor, of each leaf with the block that carries it."""
+        self.border = like.new_zeros(len(structure.owner), k, b)
+        """Block of each with its chain's block of the border."""
+
+    def add(self, chunk: TermRows[RowBlocks]) -> None:
+        """Adds a chunk of rows."""
+        self.by_variable.add(chunk)
+        plan, first = self.structure.plan, self.structure.plan.first_block
+        for i, j in pairs(len(chunk.slots)):
+            (name, block), (other, block_of_other) = chunk.slots[i], chunk.slots[j]
+            if name in first and other in first:
+                here, there = block + first[name], block_of_other + first[other]
+                self._add_link(here, there, chunk.blocks.hessian[i, j].permute(2, 0, 1))
+            elif name in first and other == plan.border:
+                beside = chunk.blocks.hessian[i, j].permute(2, 0, 1)
+                self.border.index_add_(0, block + first[name], beside)
+            elif name == plan.border and other in first:
+                beside = chunk.blocks.hessian[i, j].permute(2, 1, 0)
+                self.border.index_add_(0, block_of_other + first[other], beside)
+
+    def diagonal(self) -> Float[Tensor, "e k k"]:
+        """Diagonal blocks of A, counted over leaves and chains."""
+        return _stacked([self.by_variable.hessian(n) for n in self.structure.plan.first_block])
+
+    def gradient(self) -> Float[Tensor, "e k"]:
+        """The gradient a, likewise."""
+        return _stacked([self.by_variable.gradient(n) for n in self.structure.plan.first_block])
+
+    def _add_link(
+        self, here: Int[Tensor, " m"], there: Int[Tensor, " m"], block: Float[Tensor, "m k k"]
+    ) -> None:
+        low, high = torch.minimum(here, there), torch.maximum(here, there)
+        plan, owner = self.structure.plan, self.structure.owner
+        leaves = plan.leaf_count
+        linked = (high == low + 1) & (owner[low] == owner[high]) & (low >= leaves)
+        if plan.carrier is not None:
+            of_leaf = (low < leaves) & (high >= leaves)
+            linked[of_leaf] = plan.carrier[low[of_leaf]] == high[of_leaf] - leaves
+        if not bool(linked.all()):
+            raise ValueError(
+                "a term links two eliminated blocks that are neither neighbours in their chain "
+                "nor a leaf and the block that carries it"
+            )
+        self.link.index_add_(0, low, torch.where((here < there)[:, None, None], block, block.mT))
+
+
+class ReducibleSums(ChainSums):
+    """The same with the landmarks' matrix C and, term by term, their coupling B."""
+
+    def __init__(
+        self,
+        structure: ChainStructure,
+        problem: Problem,
+        values: Values,
+        coupling: Mapping[str, Float[Tensor, "f w k"]],
+    ) -> None:
+        """`coupling` is memory for B, by term; what is in it is of no account."""
+        super().__init__(structure, problem, values)
+        dim = structure.where.dim
+        self.coupling = coupling
+        self._matrix = values[structure.plan.chains].new_zeros(dim, dim)
+        for name, blocks in coupling.items():
+            if structure.couplings[name].factor_of_row is not None:
+                blocks.zero_()
+
+    def add(self, chunk: TermRows[RowBlocks]) -> None:
+        """Adds a chunk of rows."""
+        super().add(chunk)
+        where = self.structure.where
+        for i, j in pairs(len(chunk.slots)):
+            (name, block), (other, block_of_other) = chunk.slots[i], chunk.slots[j]
+            if name in where.offset and other in where.offset:
+                row, column = where.offset[name][block], where.offset[other][block_of_other]
+                square = chunk.blocks.hessian[i, j]
+                add_blocks(self._matrix.view(-1), row, column, where.dim, square)
+                add_blocks(self._matrix.view(-1), column, row, where.dim, square.transpose(0, 1))
+        if chunk.term in self.coupling:
+            coupling = self.structure.couplings[chunk.term]
+            _add_coupling(self.coupling[chunk.term], coupling, chunk)
+
+    def landmark_hessian(self) -> Float[Tensor, "r r"]:
+        """The matrix C."""
+        where = self.structure.where
+        for name, offset in where.offset.items():
+            square = self.by_variable.hessian(name).permute(1, 2, 0)
+            add_blocks(self._matrix.view(-1), offset, offset, where.dim, square)
+        return self._matrix
+
+    def landmark_gradient(self) -> Float[Tensor, " r"]:
+        """The gradient b."""
+        names = (*self.structure.plan.first_block, *self.structure.where.offset)
+        return self.structure.where.pack({n: self.by_variable.gradient(n) for n in names})[0]
+
+
+def _add_coupling(
+    total: Float[Tensor, "f w k"], coupling: Coupling, chunk: TermRows[RowBlocks]
+) -> None:
+    """Adds the blocks between the rows' eliminated slot and the others, in place."""
+    slot, start = coupling.slot, 0
+    for other in range(len(chunk.slots)):
+        if other == slot:
+            continue
+        block = chunk.blocks.hessian[min(slot, other), max(slot, other)]
+        block = block.permute(2, 1, 0) if slot < other else block.permute(2, 0, 1)
+        here = slice(start, start + block.shape[1])
+        start = here.stop
+        if coupling.factor_of_row is None:
+            total[chunk.at, here] = block
+        else:
+            total[:, here].index_add_(0, coupling.factor_of_row[chunk.at], block)
+
+
+def _stacked(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)

@@ -1,0 +1,278 @@
+"""The order in which chains of blocks are eliminated: odd-even reduction, worked out once per problem.
+
+Eliminated are the blocks of A in the normal equations, the landmarks' stay:
+
+    [ A  B^T ] [ x ]     [ a ]        A: leaves and chains, block tridiagonal but for the leaves
+    [ B  C   ] [ y ] = - [ b ]        B: coupling of the landmarks with them, C: landmarks
+
+The chains' blocks are those of one variable (the slow drifts of journeys). Each may carry leaves, blocks of a second
+variable that are bound to it alone (the poses of frames): leaves go first. Then every other block of each chain is
+eliminated, all chains at once; those between are the chain of the next round, half as long, until no block is left (cyclic
+or nested reduction; Golub and Van Loan, Matrix Computations, 4.5.4).
+
+Eliminating block j with the diagonal D_j and the links E_j to its neighbours leaves fill-in behind: -E_j^T D_j^-1 E_j among
+the neighbours, and -B_j D_j^-1 E_j in their coupling, in the columns of the landmarks that j is coupled to by then. Where
+that is kept, `windows` says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from torch import Tensor
+
+from crowdmap_torch.optim.problem import CostTerm, Problem, Values
+from crowdmap_torch.optim.solvers.layout import Layout, layout
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.optim.solvers.windows import Batch, LandmarkBlocks, WindowBuilder
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A term between the eliminated blocks and the landmarks, its rows sorted by (block, landmarks)."""
+
+    order: Int[Tensor, " m"] | None
+    """Rows of the term, in the order of their factors; None where they are in that order already."""
+    factor_of_row: Int[Tensor, " m"] | None
+    """Rows of one eliminated block and the same landmarks add up to one factor; None: every row is its own."""
+    block: Int[Tensor, " f"]
+    """Eliminated block of each factor, counted over leaves and chains."""
+    column: Int[Tensor, "f w"]
+    """Columns of the reduced system that the factor touches."""
+    landmark: Int[Tensor, "f q"]
+    """The same as landmark blocks."""
+    slot: int
+    """Slot of the eliminated block."""
+
+
+@dataclass(frozen=True)
+class ChainStructure:
+    """Everything about the elimination that does not depend on values."""
+
+    plan: EliminationPlan
+    where: Layout
+    """The reduced system: all variables but those that the plan names."""
+    couplings: dict[str, Coupling]
+    factor_rows: dict[str, Int[Tensor, " fw"]]
+    """Row of the store of every column of a coupling's factors."""
+    order: Int[Tensor, " places"]
+    """Block at every place of the order of elimination; the number of blocks where a group has fewer, and last."""
+    place: Int[Tensor, " e"]
+    """Place of every block."""
+    right_side_row: Int[Tensor, " e"]
+    """Row of the store of every block's right-hand side."""
+    store_rows: int
+    """Rows of the store; one more takes what is to be forgotten."""
+    rounds: tuple[tuple[Batch, ...], ...]
+    """Of blocks that do not touch each other, eliminated at once."""
+    owner: Int[Tensor, " e"]
+    """Chain that each block belongs to, counted over leaves and chains."""
+
+    @property
+    def batches(self) -> list[Batch]:
+        """Of all rounds, in order."""
+        return [batch for of_round in self.rounds for batch in of_round]
+
+    def by_place(
+        self, diagonal: Float[Tensor, "e k k"], link: Float[Tensor, "e k k"]
+    ) -> tuple[Float[Tensor, "p k k"], Float[Tensor, "p k k"]]:
+        """Diagonal blocks and links of A at the places of the order of elimination.
+
+        A place without a block has no links, and a diagonal that does no harm.
+        """
+        none = torch.eye(diagonal.shape[-1], dtype=diagonal.dtype, device=diagonal.device)[None]
+        links = torch.cat((link, torch.zeros_like(none)))
+        return torch.cat((diagonal, none))[self.order], links[self.order]
+
+    def unstack(self, stacked: Float[Tensor, "e ..."]) -> dict[str, Tensor]:
+        """Rows of the leaves and of the chains, by variable."""
+        first = self.plan.first_block
+        bounds = [*first.values(), len(stacked)]
+        return {name: stacked[a:b] for name, a, b in zip(first, bounds, bounds[1:], strict=False)}
+
+
+def analyse(
+    problem: Problem,
+    values: Values,
+    plan: EliminationPlan,
+    *,
+    group_size: int | None,
+    batch_bytes: int,
+) -> ChainStructure:
+    """The elimination of a plan's leaves and chains in a problem.
+
+    Every row may touch one eliminated block and any landmarks; or one or two eliminated blocks, neighbours of a chain or a
+    leaf and the block that carries it, and beside them the chain's own block of the border.
+    """
+    where = layout(problem, values, skip=(*plan.first_block, *_named(plan.border)))
+    landmarks = LandmarkBlocks.of(where, plan.chain.device)
+    owner = plan.owner
+    couplings = _couplings(problem.terms, plan, owner, landmarks)
+    k = problem.variables[plan.chains].tangent_dim
+    # About as many as there are drives: those that see one stretch of road at the same step.
+    size = group_size or min(64, max(4, plan.chain_count))
+    keys = _coupled_landmarks(couplings, landmarks)
+    builder = WindowBuilder(landmarks, _rank(keys, landmarks), len(owner), size, k, batch_bytes)
+    windows = [
+        builder.windows(node, neighbour, coupled)
+        for node, neighbour, coupled in _rounds(keys, plan, landmarks.count)
+    ]
+    places = [table.flatten() for _, _, batches in windows for table, _ in batches]
+    order = torch.cat((*places, owner.new_full((1,), len(owner))))
+    place = torch.full((len(owner) + 1,), len(order) - 1, device=owner.device)
+    place[order] = torch.arange(len(order), device=owner.device)
+    place[-1] = len(order) - 1
+    return ChainStructure(
+        plan=plan,
+        where=where,
+        couplings=couplings,
+        rounds=tuple(builder.round(*of_round, place) for of_round in windows),
+        factor_rows={name: builder.rows(c.block, c.landmark) for name, c in couplings.items()},
+        order=order,
+        place=place[:-1],
+        right_side_row=builder.first_row[:-1],
+        store_rows=builder.store_rows,
+        owner=owner,
+    )
+
+
+def _named(name: str | None) -> tuple[str, ...]:
+    return () if name is None else (name,)
+
+
+def _couplings(
+    terms: Mapping[str, CostTerm], plan: EliminationPlan, owner: Tensor, landmarks: LandmarkBlocks
+) -> dict[str, Coupling]:
+    """The terms between eliminated blocks and landmarks; terms that the plan has no place for are refused."""
+    first_block, couplings = plan.first_block, {}
+    for name, term in terms.items():
+        eliminated = [i for i, (slot, _) in enumerate(term.slots) if slot in first_block]
+        border = [i for i, (slot, _) in enumerate(term.slots) if slot == plan.border]
+        others = len(term.slots) - len(eliminated) - len(border)
+        if len(eliminated) > 2 or (others and len(eliminated) > 1):
+            raise ValueError(
+                f"term {name!r} couples {len(eliminated)} eliminated blocks and {others} others; "
+                "at most two eliminated blocks are supported, and one with landmarks"
+            )
+        if (others and border) or len(border) > 1:
+            raise ValueError(
+                f"term {name!r} couples a block of the border {plan.border!r} with landmarks or "
+                "another one; only its own chain's blocks are supported"
+            )
+        for i in eliminated if border else ():
+            slot, block = term.slots[i]
+            if not torch.equal(owner[block + first_block[slot]], term.slots[border[0]][1]):
+                raise ValueError(
+                    f"term {name!r} couples blocks of {slot!r} with the border of another chain"
+                )
+        if others and eliminated:
+            couplings[name] = _coupling(term, eliminated[0], landmarks, first_block)
+    return couplings
+
+
+def _coupling(
+    term: CostTerm, slot: int, landmarks: LandmarkBlocks, first_block: dict[str, int]
+) -> Coupling:
+    name, block = term.slots[slot]
+    block = block + first_block[name]
+    others = [
+        index + landmarks.first[other] for i, (other, index) in enumerate(term.slots) if i != slot
+    ]
+    # One number for the landmarks of a row: mixed radix, hashed down before it can overflow.
+    key = block
+    for at, index in enumerate(others):
+        if at:
+            _, key = torch.unique(key, return_inverse=True)
+        key = key * landmarks.count + index
+    order = None
+    if not bool((key[1:] >= key[:-1]).all()):
+        order = torch.argsort(key, stable=True)
+        key = key[order]
+    begins = torch.ones_like(key, dtype=torch.bool)
+    begins[1:] = key[1:] != key[:-1]
+    factor_of_row = None if bool(begins.all()) else begins.cumsum(0) - 1
+    first = torch.nonzero(begins)[:, 0]
+    first = first if order is None else order[first]
+    landmark = torch.stack([index[first] for index in others], dim=-1)
+    column = torch.cat(
+        [
+            landmarks.column[index[first]][:, None]
+            + torch.arange(_width(landmarks, other), device=block.device)
+            for (other, _), index in zip(
+                (s for i, s in enumerate(term.slots) if i != slot), others, strict=True
+            )
+        ],
+        dim=-1,
+    )
+    return Coupling(order, factor_of_row, block[first], column, landmark, slot)
+
+
+def _width(landmarks: LandmarkBlocks, name: str) -> int:
+    first = landmarks.first[name]
+    return int(landmarks.width[first]) if first < len(landmarks.width) else 0
+
+
+def _coupled_landmarks(
+    couplings: dict[str, Coupling], landmarks: LandmarkBlocks
+) -> Int[Tensor, " keys"]:
+    """Which block is coupled to which landmark: keys `block * count + landmark`, sorted and unique."""
+    keys = [(c.block[:, None] * landmarks.count + c.landmark).flatten() for c in couplings.values()]
+    none = torch.zeros(0, dtype=torch.long, device=landmarks.column.device)
+    return torch.unique(torch.cat([none, *keys]))
+
+
+def _rank(keys: Int[Tensor, " keys"], landmarks: LandmarkBlocks) -> Float[Tensor, " q"]:
+    """A position of every landmark on a line, such that landmarks coupled to one block are near each other."""
+    count = landmarks.count
+    # Blocks of a chain are coupled to nearly what their neighbours are: a few of them together tell the same.
+    row, column = (keys // count // 8).cpu().numpy(), (keys % count).cpu().numpy()
+    rows = int(row.max()) + 1 if len(row) else 1
+    coupled = coo_matrix((torch.ones(len(row)).numpy(), (row, column)), shape=(rows, count)).tocsr()
+    order = reverse_cuthill_mckee((coupled.T @ coupled).tocsr(), symmetric_mode=True)
+    rank = torch.empty(count, dtype=torch.double)
+    rank[torch.from_numpy(order.astype("int64"))] = torch.arange(count, dtype=torch.double)
+    return rank.to(keys.device)
+
+
+def _rounds(
+    keys: Int[Tensor, " keys"], plan: EliminationPlan, count: int
+) -> Iterator[tuple[Int[Tensor, " g"], Int[Tensor, "g s"], Int[Tensor, " keys_g"]]]:
+    """Per round the blocks that go, their neighbours, and the landmarks they are coupled to by then, as keys."""
+    leaves, n = plan.leaf_count, plan.leaf_count + len(plan.chain)
+    index = torch.arange(n, device=plan.chain.device)
+    if plan.carrier is not None and leaves:
+        neighbour = (plan.carrier + leaves)[:, None]
+        yield index[:leaves], neighbour, keys[keys < leaves * count]
+        keys = _filled_in(keys, index[:leaves], neighbour, n, count)
+    node = index[leaves:]
+    while len(node):
+        of = plan.chain[node - leaves]
+        first = torch.ones_like(of, dtype=torch.bool)
+        first[1:] = of[1:] != of[:-1]
+        at = torch.arange(len(node), device=node.device)
+        goes = (at - at[first][first.cumsum(0) - 1]) % 2 == 0
+        last = torch.cat((first[1:], first.new_ones(1)))
+        before = torch.where(first, n, torch.cat((node[:1], node[:-1])))
+        behind = torch.where(last, n, torch.cat((node[1:], node[-1:])))
+        neighbour = torch.stack((before, behind), dim=-1)[goes]
+        gone = torch.zeros(n, dtype=torch.bool, device=node.device)
+        gone[node[goes]] = True
+        yield node[goes], neighbour, keys[gone[keys // count]]
+        keys = _filled_in(keys, node[goes], neighbour, n, count)
+        node = node[~goes]
+
+
+def _filled_in(
+    keys: Int[Tensor, " keys"], node: Tensor, neighbour: Tensor, n: int, count: int
+) -> Int[Tensor, " keys_after"]:
+    """The couplings of the blocks that stay once `node` are gone: their own, and the fill-in from their neighbours."""
+    receiver = torch.arange(n + 1, device=keys.device)[:, None].repeat(1, neighbour.shape[1])
+    receiver[node] = neighbour
+    block, landmark = keys // count, keys % count
+    receivers = receiver[block]
+    return torch.unique((receivers * count + landmark[:, None])[receivers < n])

@@ -1,0 +1,174 @@
+"""Damped normal equations: what every back end makes of a linearised problem, and what it can be asked for.
+
+Around a point with cost c, gradient g and Gauss-Newton Hessian H the model of the cost is a parabola, and a step of it is
+damped by the factor t on the Hessian's diagonal:
+
+    m(s) = c + g.s + s.H s / 2        (H + D) s = -g        D = t diag(H)        m(0) - m(s) = (s.D s - g.s) / 2
+
+A back end has two methods: `assemble(problem, values)` gives normal equations at a point, and these give the step for a
+damping, so that a rejected step costs a solve and not a linearisation. How sure the unknowns are is asked of the same
+equations, as covariances of linear functions of the tangents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.optim.problem import Problem, Values
+
+DIAGONAL_FLOOR = 1e-9
+"""Least diagonal entry that the damping scales, so that an unseen block keeps a solvable equation."""
+
+Tangents = Mapping[str, Tensor]
+"""One tangent of every block, `[n, k]` by variable, or several at once, `[n, k, c]`."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the tangents, and what the quadratic model says of it."""
+
+    delta: Tangents
+    predicted: Float[Tensor, " groups"]
+    """Decrease of the cost that the model predicts."""
+    solved: Bool[Tensor, " groups"]
+    """False where the matrix was not positive definite."""
+    norm: Float[Tensor, " groups"]
+    """Length of the step in tangent units."""
+
+
+@dataclass(frozen=True)
+class StepPart:
+    """Some of the unknowns in a step, by independent problem."""
+
+    step: Float[Tensor, "groups ..."]
+    gradient: Float[Tensor, "groups ..."]
+    added: Float[Tensor, "groups ..."]
+    """What the damping adds to the Hessian's diagonal, D."""
+
+
+def solved_step(
+    delta: Tangents, *parts: StepPart, solved: Bool[Tensor, " groups"] | None = None
+) -> Step:
+    """The step `delta`, whose unknowns are those of `parts`; `solved` where it is finite, unless told otherwise."""
+    along, damped, squared = (
+        torch.stack([term.flatten(1).sum(1) for term in terms]).sum(0)
+        for terms in (
+            [part.gradient * part.step for part in parts],
+            [part.added * part.step.square() for part in parts],
+            [part.step.square() for part in parts],
+        )
+    )
+    norm = squared.sqrt()
+    solved = norm.isfinite() if solved is None else solved
+    return Step(delta, torch.where(solved, (damped - along) / 2, 0.0), solved, norm)
+
+
+def failed_step(like: Tangents, cost: Float[Tensor, " groups"]) -> Step:
+    """The step that moves nothing, as the matrix is not positive definite; `like` are tangents of its shapes."""
+    still = {name: torch.zeros_like(tangent) for name, tangent in like.items()}
+    nothing = torch.zeros_like(cost)
+    return Step(still, nothing, torch.zeros_like(cost, dtype=torch.bool), nothing)
+
+
+@dataclass(frozen=True)
+class LinearFunctions:
+    """`m` linear functions of the tangents in each of `n` rows; like a cost term's, a row touches one block per slot."""
+
+    slots: tuple[tuple[str, Int[Tensor, " n"]], ...]
+    jacobians: tuple[Float[Tensor, "n m _"], ...]
+    """Per slot the derivatives by the block's tangent."""
+
+    @classmethod
+    def of_tangents(
+        cls, slots: tuple[tuple[str, Int[Tensor, " n"]], ...], like: Tensor, *dims: int
+    ) -> LinearFunctions:
+        """The tangents of each row's blocks themselves, one behind the other; `dims` are their sizes, by slot."""
+        eye = torch.eye(sum(dims), dtype=like.dtype, device=like.device)
+        parts = eye.split(dims, dim=1)
+        rows = len(slots[0][1])
+        return cls(slots, tuple(part.expand(rows, *part.shape) for part in parts))
+
+
+@runtime_checkable
+class Covariance(Protocol):
+    """The inverse of the Hessian, as far as it is asked for."""
+
+    def of(self, functions: LinearFunctions) -> Float[Tensor, "n m m"]:
+        """Covariance of each row's functions."""
+        ...
+
+
+@runtime_checkable
+class MapCovariance(Covariance, Protocol):
+    """That of landmarks whose observers were eliminated along chains; `of` is told of landmarks alone."""
+
+    def common(self, functions: LinearFunctions) -> Float[Tensor, "m m"]:
+        """What all rows have in common.
+
+        The largest covariance that can be taken off all of them together, so that what is left is a covariance.
+        """
+        ...
+
+    def of_chain_sums(self, weight: Float[Tensor, "n k m"]) -> Float[Tensor, "j m m"]:
+        """Covariance of `m` weighted sums over each chain's own blocks."""
+        ...
+
+
+@runtime_checkable
+class NormalEquations(Protocol):
+    """The quadratic model of the cost around a point."""
+
+    @property
+    def cost(self) -> Float[Tensor, " groups"]:
+        """Cost at the point."""
+        ...
+
+    @property
+    def term_cost(self) -> Mapping[str, Float[Tensor, " groups"]]:
+        """The same by term."""
+        ...
+
+    def solve(self, damping: Float[Tensor, " groups"]) -> Step:
+        """The step of the model whose Hessian's diagonal is raised by the factor `1 + damping`."""
+        ...
+
+    def covariance(self) -> Covariance:
+        """The inverse of the Hessian, undamped."""
+        ...
+
+
+@runtime_checkable
+class MapEquations(NormalEquations, Protocol):
+    """Those of a map: the observers' blocks form chains, and are eliminated."""
+
+    def covariance(self) -> MapCovariance:
+        """The inverse of the Hessian, undamped."""
+        ...
+
+    def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
+        """Covariance of every block of an eliminated variable, landmarks and border known."""
+        ...
+
+
+@runtime_checkable
+class Backend(Protocol):
+    """A way to assemble and solve normal equations."""
+
+    def assemble(self, problem: Problem, values: Values) -> NormalEquations:
+        """Normal equations at `values`."""
+        ...
+
+
+@runtime_checkable
+class MapBackend(Backend, Protocol):
+    """A way to assemble and solve those of a map."""
+
+    def assemble(self, problem: Problem, values: Values) -> MapEquations:
+        """Normal equations at `values`."""
+        ...

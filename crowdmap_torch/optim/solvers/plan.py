@@ -1,0 +1,68 @@
+"""Which unknowns a back end eliminates, and in what order: said once, where the problem is built."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class EliminationPlan:
+    """Leaves go first, then the chains they hang on; what is not named are landmarks, solved for together; the border last.
+
+    A frame's pose is a leaf on the drift of its journey, the drift of a journey is a chain, and the journey's bias its
+    block of the border. Chains do not touch each other but through landmarks.
+    """
+
+    chains: str
+    """Variable whose blocks form the chains."""
+    chain: Int[Tensor, " n"]
+    """Chain of each of them; the blocks of a chain are adjacent and in order."""
+    leaves: str | None = None
+    """Variable whose blocks are bound to one block of a chain each; None: there is none."""
+    carrier: Int[Tensor, " m"] | None = None
+    """Block of the chains that each leaf hangs on."""
+    border: str | None = None
+    """Variable of which each chain has a block of its own, that of its number; None: there is none."""
+
+    def __post_init__(self) -> None:
+        """Refuses chains in pieces, and leaves that hang on nothing."""
+        pieces = 1 + int((self.chain[1:] != self.chain[:-1]).sum()) if len(self.chain) else 0
+        if pieces != self.chain_count:
+            raise ValueError(
+                f"chain: expected the blocks of a chain of {self.chains!r} behind each other, found "
+                f"{self.chain_count} chains in {pieces} pieces; sort the blocks by chain"
+            )
+        if (self.leaves is None) != (self.carrier is None):
+            raise ValueError("leaves and carrier: expected both or neither")
+        if self.carrier is not None and not bool(
+            ((self.carrier >= 0) & (self.carrier < len(self.chain))).all()
+        ):
+            raise ValueError(f"carrier: expected blocks of {self.chains!r}, 0 to {len(self.chain)}")
+
+    @property
+    def chain_count(self) -> int:
+        """Number of chains that have a block."""
+        return len(torch.unique(self.chain))
+
+    @property
+    def leaf_count(self) -> int:
+        """Number of leaves."""
+        return 0 if self.carrier is None else len(self.carrier)
+
+    @property
+    def first_block(self) -> dict[str, int]:
+        """First block of each eliminated variable, counted over leaves and chains."""
+        if self.leaves is None:
+            return {self.chains: 0}
+        return {self.leaves: 0, self.chains: self.leaf_count}
+
+    @property
+    def owner(self) -> Int[Tensor, " e"]:
+        """Chain that each eliminated block belongs to, counted over leaves and chains."""
+        if self.carrier is None:
+            return self.chain
+        return torch.cat((self.chain[self.carrier], self.chain))

@@ -1,0 +1,224 @@
+"""Where the fill-in of eliminated blocks is kept: windows of columns, and their rows in one store.
+
+An eliminated block leaves fill-in in the columns of the landmarks that it is coupled to, by then: its window. Blocks that
+see the same stretch of road, driven by anybody, form a group with one window, so that their products are one matrix product.
+Groups of the same width are computed together, in batches of bounded size. The store has one row per block and column of
+its window, and is as wide as a block; batch follows batch in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from crowdmap_torch.optim.solvers.layout import Layout
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Groups of equal width whose blocks are eliminated together; `b` groups of `g` places."""
+
+    place: slice
+    """Places of the order of elimination, group by group."""
+    neighbour: Int[Tensor, "e s"]
+    """Places of the blocks that each is linked to: before and behind it in the chain, or a leaf's carrier; the
+    last place of all for none."""
+    columns: Int[Tensor, "b w"]
+    """The windows: columns of the reduced system; first its right-hand side, `dim`, and `dim + 1` for padding."""
+    fill: Int[Tensor, "b g w s"]
+    """Row of the store that each entry's fill-in goes to, for every neighbour of the block."""
+    first_row: int
+    """Where the batch's rows begin in the store."""
+
+
+@dataclass(frozen=True)
+class LandmarkBlocks:
+    """The blocks of the variables that stay, numbered behind each other."""
+
+    first: dict[str, int]
+    """Number of each variable's first block."""
+    column: Int[Tensor, " q"]
+    """First column of every block."""
+    width: Int[Tensor, " q"]
+    dim: int
+
+    @classmethod
+    def of(cls, where: Layout, device: torch.device) -> LandmarkBlocks:
+        """Those of a reduced system."""
+        first, columns, widths, total = {}, [], [], 0
+        for name, offset in where.offset.items():
+            first[name] = total
+            total += len(offset)
+            columns.append(offset)
+            widths.append(torch.full_like(offset, where.tangent_dim[name]))
+        none = torch.zeros(0, dtype=torch.long, device=device)
+        return cls(first, torch.cat([none, *columns]), torch.cat([none, *widths]), where.dim)
+
+    @property
+    def count(self) -> int:
+        """At least one, so that keys can be taken apart."""
+        return max(len(self.column), 1)
+
+
+@dataclass
+class WindowBuilder:
+    """Lays the rounds out in the store."""
+
+    landmarks: LandmarkBlocks
+    rank: Tensor
+    n: int
+    group_size: int
+    k: int
+    batch_bytes: int
+
+    def __post_init__(self) -> None:
+        device = self.rank.device
+        self.store_rows = 0
+        self.places = 0
+        self.batch_rows: list[int] = []
+        self.first_row = torch.full((self.n + 1,), -1, dtype=torch.long, device=device)
+        self.group_of = torch.full((self.n + 1,), -1, dtype=torch.long, device=device)
+        self.groups = 0
+        self.window_keys: list[Tensor] = []
+        self.window_places: list[Tensor] = []
+        # The blocks of a variable lie behind each other, and so do the variables.
+        width = self.landmarks.width
+        self.landmark_of = torch.repeat_interleave(torch.arange(len(width), device=device), width)
+        self._keys = self._places = torch.zeros(0, dtype=torch.long, device=device)
+
+    def windows(
+        self, node: Tensor, neighbour: Tensor, keys: Tensor
+    ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
+        """Groups the blocks of a round, and gives every group its window and its rows in the store."""
+        count, device = self.landmarks.count, node.device
+        place = torch.full((self.n + 1,), -1, dtype=torch.long, device=device)
+        place[node] = torch.arange(len(node), device=device)
+        block, landmark = place[keys // count], keys % count
+        width = torch.zeros(len(node), dtype=torch.double, device=device)
+        width.index_add_(0, block, self.landmarks.width[landmark].double())
+        position = torch.zeros_like(width).index_add_(
+            0, block, self.rank[landmark] * self.landmarks.width[landmark]
+        ) / width.clamp_min(1)
+        # Blocks that see lanes have windows several times as wide as those that see signs alone: keep them apart.
+        wide = width > width.mean()
+        order = torch.argsort(position + wide * (len(self.rank) + 1), stable=True)
+        size = self.group_size
+        if bool(width.mean() > self.landmarks.dim / 2):
+            size = min(len(node), 4 * size)
+        group_count = -(-len(node) // size)
+        table = torch.full((group_count * size,), self.n, dtype=torch.long, device=device)
+        table[: len(node)] = node[order]
+        group = torch.empty(len(node), dtype=torch.long, device=device)
+        group[order] = torch.arange(len(node), device=device) // size
+        window = torch.unique(group[block] * count + landmark)
+        of, landmark = window // count, window % count
+        each = self.landmarks.width[landmark]
+        # The gradient is every window's first column.
+        start = each.cumsum(0) - each
+        total = torch.zeros(group_count, dtype=torch.long, device=device).index_add_(0, of, each)
+        start = start - (total.cumsum(0) - total)[of] + 1
+        self.window_keys.append((self.groups + of) * count + landmark)
+        self.window_places.append(start)
+        padded = _padded(total + 1)
+        table = table.view(group_count, size)
+        batches = []
+        for w in torch.unique(padded).tolist():
+            members = torch.nonzero(padded == w)[:, 0]
+            most = max(1, self.batch_bytes // (size * w * self.k * 8))
+            for part in members.split(most):
+                rows = self.store_rows + torch.arange(len(part) * size, device=device).mul_(w).view(
+                    -1, size
+                )
+                self.first_row[table[part]] = rows
+                self.group_of[table[part]] = self.groups + part[:, None].expand(-1, size)
+                self.batch_rows.append(self.store_rows)
+                batches.append((table[part], _expand(of, landmark, start, part, w, self)))
+                self.store_rows += len(part) * size * w
+        self.first_row[self.n] = self.group_of[self.n] = -1
+        self.groups += group_count
+        return node, neighbour, batches
+
+    def round(
+        self, node: Tensor, neighbour: Tensor, batches: list[tuple[Tensor, Tensor]], place: Tensor
+    ) -> tuple[Batch, ...]:
+        """The round with the rows that every fill-in goes to; once all rounds have their windows."""
+        towards = torch.full(
+            (self.n + 1, neighbour.shape[1]), self.n, dtype=torch.long, device=node.device
+        )
+        towards[node] = neighbour
+        built = []
+        for nodes, columns in batches:
+            receiver = towards[nodes]
+            fill = self._fill_rows(columns, receiver)
+            here = slice(self.places, self.places + nodes.numel())
+            self.places = here.stop
+            beside = place[receiver].flatten(0, 1)
+            built.append(Batch(here, beside, columns, fill, self.batch_rows.pop(0)))
+        return tuple(built)
+
+    def _fill_rows(self, columns: Tensor, receiver: Tensor) -> Tensor:
+        """Store rows [b, g, w, s] of the windows' columns at the receivers [b, g, s]."""
+        dim = self.landmarks.dim
+        known = columns < dim
+        lm = rest = torch.zeros_like(columns)[:, None, :, None]
+        if dim:
+            at = torch.where(known, columns, 0)
+            lm = self.landmark_of[at]
+            lm, rest = lm[:, None, :, None], (at - self.landmarks.column[lm])[:, None, :, None]
+        place, found = self._place(self.group_of[receiver][:, :, None, :], lm)
+        is_gradient = (columns == dim)[:, None, :, None]
+        row = self.first_row[receiver][:, :, None, :] + torch.where(is_gradient, 0, place + rest)
+        has = (receiver < self.n)[:, :, None, :]
+        good = has & (is_gradient | (found & known[:, None, :, None]))
+        return torch.where(good, row, self.store_rows)
+
+    def rows(self, block: Tensor, landmark: Tensor) -> Tensor:
+        """Store rows of factors' columns, one behind the other."""
+        parts = []
+        for at in range(landmark.shape[1]):
+            lm = landmark[:, at]
+            place, _ = self._place(self.group_of[block], lm)
+            width = int(self.landmarks.width[lm[0]]) if len(lm) else 0
+            start = self.first_row[block] + place
+            parts.append(start[:, None] + torch.arange(width, device=block.device))
+        return torch.cat(parts, dim=-1).flatten()
+
+    def _place(self, group: Tensor, landmark: Tensor) -> tuple[Tensor, Tensor]:
+        """Where a landmark stands in a group's window, and whether it does."""
+        if self.window_keys:
+            self._keys, self._places = torch.cat(self.window_keys), torch.cat(self.window_places)
+            self.window_keys, self.window_places = [], []
+        group, landmark = torch.broadcast_tensors(group, landmark)
+        key = group * self.landmarks.count + landmark
+        if not len(self._keys):
+            return torch.zeros_like(key), torch.zeros_like(key, dtype=torch.bool)
+        at = torch.searchsorted(self._keys, key).clamp_max(len(self._keys) - 1)
+        return self._places[at], self._keys[at] == key
+
+
+def _expand(
+    of: Tensor, landmark: Tensor, start: Tensor, part: Tensor, w: int, builder: WindowBuilder
+) -> Tensor:
+    """Columns [b, w] of the windows of the groups `part`."""
+    landmarks = builder.landmarks
+    columns = torch.full((len(part), w), landmarks.dim + 1, dtype=torch.long, device=of.device)
+    columns[:, 0] = landmarks.dim
+    row = torch.full((int(of.max()) + 1 if len(of) else 1,), -1, device=of.device)
+    row = torch.cat((row, row.new_full((int(part.max()) + 1,), -1)))
+    row[part] = torch.arange(len(part), device=of.device)
+    mine = torch.nonzero(row[of] >= 0)[:, 0]
+    each = landmarks.width[landmark[mine]]
+    entry = torch.repeat_interleave(torch.arange(len(mine), device=of.device), each)
+    rest = torch.arange(len(entry), device=of.device) - (each.cumsum(0) - each)[entry]
+    at = mine[entry]
+    columns[row[of[at]], start[at] + rest] = landmarks.column[landmark[at]] + rest
+    return columns
+
+
+def _padded(width: Tensor) -> Tensor:
+    """Widths rounded up by at most an eighth, so that there are few different ones."""
+    step = (2.0 ** (width.double().log2().floor() - 3)).clamp_min(4).long()
+    return -(-width // step) * step

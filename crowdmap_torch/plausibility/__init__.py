@@ -1,0 +1,1 @@
+"""What looks wrong with a data set before it is mapped: each finding with its likely cause and cure."""

@@ -1,0 +1,255 @@
+"""Whether signs seen from several frames meet in one point, and if not, under which mistake they do.
+
+Rays to one sign meet if poses, frames, lens and pixels belong together; what keeps them apart is noise of a pixel and
+the drift of the poses over a few tens of metres. Each usual mistake is undone in turn: if the rays of most journeys
+then meet much better, it is the cause.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry.camera import Camera, unproject
+from crowdmap_torch.geometry.triangulation import midpoint_ragged
+from crowdmap_torch.plausibility.finding import Finding
+from crowdmap_torch.tables import Journey, Tracklets
+
+
+@dataclass(frozen=True)
+class ConsistencyLimits:
+    """When rays meet so much better that a mistake is named."""
+
+    least_views: int = 6
+    """Views of a sign that counts."""
+    least_parallax_deg: float = 3.0
+    """Root mean square angle between its rays."""
+    better: float = 0.75
+    """Misfit under another lens against that of what is given, in the median over journeys."""
+    better_shifted: float = 0.93
+    """The same of frames shifted: less will do, since the best of several shifts is the same in most journeys."""
+    agreeing: float = 0.8
+    """Share of the journeys in which it has to be smaller."""
+    shifts: tuple[int, ...] = (-3, -2, -1, 1, 2, 3)
+    """Frames by which the numbers may be off."""
+    least_journeys: int = 4
+    """Journeys from which a lever arm is concluded: what one shows is mostly the drift of its poses."""
+    least_lever_m: float = 0.6
+    """Shorter levers are not named."""
+    sure: float = 3.0
+    """Standard deviations that a lever has to exceed."""
+
+
+_REWEIGHTINGS = 8
+"""Rounds of reweighting by Cauchy's loss."""
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Views of the signs of one journey: raw pixels of the outlines' middles."""
+
+    px: Float[Tensor, "m 2"]
+    frame: Int[Tensor, " m"]
+    sign: Int[Tensor, " m"]
+    count: int
+
+
+def consistency_findings(
+    journeys: Sequence[Journey],
+    tracklets: Sequence[Tracklets],
+    limits: ConsistencyLimits | None = None,
+) -> list[Finding]:
+    """Mistakes of all journeys under which their signs' rays do not meet."""
+    limits = limits or ConsistencyLimits()
+    given_px: list[float] = []
+    levers: list[Tensor] = []
+    tried: dict[str, list[float]] = {}
+    findings: dict[str, Finding] = {}
+    for journey, tracks in zip(journeys, tracklets, strict=True):
+        views = _views(journey, tracks, limits)
+        rays = None if views is None else _rays(views, journey.rig.camera)
+        given = math.inf if rays is None else _misfit(journey, rays, 0, limits)
+        if views is None or rays is None or not math.isfinite(given):
+            continue
+        given_px.append(given)
+        levers.append(_lever(journey, rays))
+        for name, camera, shift, finding in _instead(journey, limits):
+            other = rays if camera is journey.rig.camera else _rays(views, camera)
+            tried.setdefault(name, []).append(_misfit(journey, other, shift, limits) / given)
+            findings[name] = finding
+    named = []
+    for name, ratios in tried.items():
+        found, is_shift = torch.tensor(ratios), findings[name].kind == "frame-offset"
+        others = [torch.tensor(tried[n]) for n in tried if is_shift and n != name and "offset" in n]
+        best = torch.stack([torch.ones_like(found), *others]).amin(0)
+        enough = limits.better_shifted if is_shift else limits.better
+        ratio = float(found.median())
+        if ratio < enough and float((found < best).double().mean()) >= limits.agreeing:
+            named.append((ratio, name))
+    if not named:
+        return _lever_findings(levers, limits)
+    ratio, name = min(named)
+    usual = sorted(given_px)[len(given_px) // 2]
+    evidence = (
+        f"rays to one sign miss each other by {usual:.1f} px, and by {ratio * usual:.1f} px if"
+    )
+    return [replace(findings[name], evidence=f"{evidence} {findings[name].evidence}")]
+
+
+def _views(journey: Journey, tracks: Tracklets, limits: ConsistencyLimits) -> _Views | None:
+    label = tracks.label
+    often = torch.bincount(label[label >= 0], minlength=tracks.count) >= limits.least_views
+    used = (
+        torch.nonzero((label >= 0) & often[label.clamp_min(0)])[:, 0] if tracks.count else label[:0]
+    )
+    if not len(used):
+        return None
+    sign, compact = label[used].unique(return_inverse=True)
+    corners = journey.signs.corners_px[used]
+    middle = (corners.amin(1) + corners.amax(1)) / 2
+    return _Views(middle, journey.signs.frame[used], compact, len(sign))
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Views as directions in the camera's frame."""
+
+    views: _Views
+    ray_camera: Float[Tensor, "m 3"]
+    closes: Bool[Tensor, " m"]
+    focal_px: float
+
+
+def _rays(views: _Views, camera: Camera) -> _Rays:
+    ideal, closes = unproject(camera, views.px)
+    ray = torch.nn.functional.normalize(torch.nn.functional.pad(ideal, (0, 1), value=1.0), dim=-1)
+    return _Rays(views, ray, closes, float(camera.K[0, 0]))
+
+
+def _misfit(journey: Journey, rays: _Rays, shift: int, limits: ConsistencyLimits) -> float:
+    """Median over the views of the distance between a sign's middle and where all its rays together put it [px]."""
+    views = rays.views
+    frame = (views.frame + shift).clamp(0, journey.frame_count - 1)
+    T_world_camera = journey.T_world_camera[frame]
+    origin, ray = T_world_camera[:, :3, 3], se3.rotate(T_world_camera, rays.ray_camera)
+    first, _ = midpoint_ragged(origin, ray, views.sign, views.count, rays.closes.to(ray))
+    # Once more with angles alike, not metres.
+    weight = rays.closes / (first[views.sign] - origin).norm(dim=-1).clamp_min(1.0).square()
+    point, spread = midpoint_ragged(origin, ray, views.sign, views.count, weight)
+    to_point = point[views.sign] - origin
+    towards = torch.nn.functional.normalize(to_point, dim=-1)
+    angle = torch.linalg.cross(towards, ray).norm(dim=-1)
+    least = math.radians(limits.least_parallax_deg) ** 2
+    counted = rays.closes & (spread[views.sign] > least) & ((towards * ray).sum(-1) > 0)
+    if int(counted.sum()) < limits.least_views:
+        return math.inf
+    return float(angle[counted].median()) * rays.focal_px
+
+
+def _lever(journey: Journey, rays: _Rays) -> Float[Tensor, " 3"]:
+    """Where, in the camera's frame, the poses' positions are of, if not of the camera, by the rays' best meeting [m].
+
+    A lever moves all views of a straight drive alike; only where the car turns does it keep rays apart. Signs are
+    eliminated, what is left are three unknowns.
+    """
+    views = rays.views
+    T = journey.T_world_camera[views.frame]
+    R, given = T[:, :3, :3], T[:, :3, 3]
+    ray = se3.rotate(T, rays.ray_camera)
+    eye = torch.eye(3, dtype=ray.dtype, device=ray.device)
+    across = eye - ray[:, :, None] * ray[:, None]
+    weight, lever = rays.closes.to(ray), ray.new_zeros(3)
+    for _ in range(_REWEIGHTINGS):
+        origin = given - R @ lever
+        point, _ = midpoint_ragged(origin, ray, views.sign, views.count, weight)
+        off = (across @ (origin - point[views.sign])[..., None])[..., 0]
+        away = (point[views.sign] - origin).norm(dim=-1).clamp_min(1.0)
+        angle = off.norm(dim=-1) / away
+        usual = angle.median().clamp_min(1e-6)
+        weight = rays.closes / away.square() / (1 + (angle / usual).square())
+        by_point = weight[:, None, None] * across
+        # [[A, B], [B^T, C]] over signs and the lever; A is block diagonal.
+        A = ray.new_zeros(views.count, 3, 3).index_add(0, views.sign, by_point) + 1e-9 * eye
+        B = ray.new_zeros(views.count, 3, 3).index_add(0, views.sign, by_point @ R)
+        at = (by_point @ given[..., None])[..., 0]
+        right = ray.new_zeros(views.count, 3).index_add(0, views.sign, at)
+        solved = torch.linalg.solve(A, torch.cat((B, right[..., None]), dim=-1))
+        C = (R.mT @ by_point @ R).sum(0) - (B.mT @ solved[..., :3]).sum(0)
+        rest = (R.mT @ at[..., None])[..., 0].sum(0) - (B.mT @ solved[..., 3:])[..., 0].sum(0)
+        lever = torch.linalg.solve(C + 1e-9 * eye, rest)
+    return lever
+
+
+def _lever_findings(levers: Sequence[Tensor], limits: ConsistencyLimits) -> list[Finding]:
+    """Whether the journeys agree that positions are of another place on the car, ahead of the camera or behind it."""
+    if len(levers) < limits.least_journeys:
+        return []
+    ahead = torch.stack(list(levers))[:, 2]
+    usual = float(ahead.median())
+    # The median's own sigma, by the journeys' spread.
+    sigma = 1.86 * float((ahead - usual).abs().median()) / len(ahead) ** 0.5
+    if abs(usual) < max(limits.least_lever_m, limits.sure * sigma):
+        return []
+    where = "ahead of" if usual > 0 else "behind"
+    return [
+        Finding(
+            "lever-arm",
+            f"rays to one sign meet best if positions are of a place {abs(usual):.1f} m {where} "
+            f"the camera (sigma {sigma:.1f} m)",
+            "positions are of an antenna or an IMU, not of the pose link",
+            "give the rig a mount (rig.urdf) from that place to the camera",
+        )
+    ]
+
+
+def _instead(
+    journey: Journey, limits: ConsistencyLimits
+) -> Iterator[tuple[str, Camera, int, Finding]]:
+    camera = journey.rig.camera
+    for shift in limits.shifts:
+        cause = "frame numbers of detections and poses do not match"
+        yield (
+            f"frame-offset {shift}",
+            camera,
+            shift,
+            Finding(
+                "frame-offset",
+                f"detections are taken {abs(shift)} frames {'later' if shift > 0 else 'earlier'}",
+                cause,
+                "number detections by the frame that they were made in",
+            ),
+        )
+    lens = camera.distortion
+    if not bool((lens != 0).any()):
+        return
+    yield (
+        "undistorted",
+        replace(camera, distortion=torch.zeros_like(lens)),
+        0,
+        Finding(
+            "undistorted",
+            "the lens has no distortion",
+            "detections are in undistorted pixels",
+            "write raw pixels, or a rig without distortion",
+        ),
+    )
+    if camera.model == "brown_conrady" and len(lens) >= 4:
+        k1, k2, *rest = (*lens.tolist(), 0.0)[:5]
+        order = lens.new_tensor([k1, k2, rest[1], rest[2], rest[0]])
+        yield (
+            "coefficient-order",
+            replace(camera, distortion=order),
+            0,
+            Finding(
+                "coefficient-order",
+                "the coefficients are k1, k2, k3, p1, p2",
+                "distortion coefficients are in another order",
+                "write k1, k2, p1, p2, k3 (OpenCV's order)",
+            ),
+        )

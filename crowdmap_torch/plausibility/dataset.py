@@ -1,0 +1,87 @@
+"""A look at a whole data set before it is mapped: what looks wrong, one line for each cause."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from crowdmap_torch.io.columns import Sheet
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.plausibility.consistency import consistency_findings
+from crowdmap_torch.plausibility.detections import Outlines, detection_findings
+from crowdmap_torch.plausibility.finding import Finding, gathered
+from crowdmap_torch.plausibility.poses import pose_findings
+from crowdmap_torch.plausibility.rig import rig_findings
+from crowdmap_torch.tables import Dataset, Journey
+from crowdmap_torch.tracking.sign_features import SignAssociationConfig
+from crowdmap_torch.tracking.signs import associate_signs
+
+_MOST_TRIANGULATED = 12
+"""Journeys whose signs are triangulated for the look: mistakes are made in all alike."""
+
+
+@torch.no_grad()
+def look_over(
+    folder: Path, dataset: Dataset, positioning: PositioningNoise, config: SignAssociationConfig
+) -> tuple[Finding, ...]:
+    """What looks wrong with the journeys of the data set in `folder`, each finding once.
+
+    Signs are triangulated only where nothing else is wrong: a mistake that shows by itself spoils them too.
+    """
+    found = [
+        (journey.journey_id, finding)
+        for journey in dataset.journeys
+        for finding in _findings_of(folder / "journeys" / journey.journey_id, journey, dataset)
+    ]
+    found += list(_copies(dataset.journeys))
+    spoiled = {journey for journey, finding in found if finding.kind not in _HARMLESS}
+    sound = [j for j in dataset.journeys if j.journey_id not in spoiled and len(j.signs)]
+    some = sound[:: -(-len(sound) // _MOST_TRIANGULATED)] if sound else []
+    tracklets = [associate_signs(journey, positioning, config) for journey in some]
+    names = [journey.journey_id for journey in some]
+    found += [
+        (name, finding) for finding in consistency_findings(some, tracklets) for name in names
+    ]
+    return gathered(found)
+
+
+_HARMLESS = ("sigmas", "copies", "road-normal", "camera-height", "leap")
+"""Findings that do not keep the rays to a sign from meeting."""
+
+
+def _findings_of(folder: Path, journey: Journey, dataset: Dataset) -> Iterator[Finding]:
+    yield from rig_findings(journey.rig)
+    yield from pose_findings(journey, dataset.origin)
+    signs, lanes = (_outlines(folder / f"{name}.parquet") for name in ("signs", "lanes"))
+    yield from detection_findings(signs, lanes, journey.rig)
+
+
+def _outlines(path: Path) -> Outlines:
+    """The rows of a file that the data set's reader has accepted, with those that it dropped."""
+    sheet = Sheet(path, ("u", "v"))
+    u, v = sheet.number_lists("u"), sheet.number_lists("v")
+    return Outlines(np.stack((u.values, v.values), axis=-1), u.count)
+
+
+def _copies(journeys: Sequence[Journey]) -> Iterator[tuple[str, Finding]]:
+    """Journeys whose detections are those of another one to the last bit."""
+    first: dict[bytes, str] = {}
+    for journey in journeys:
+        if not len(journey.signs) + len(journey.lanes):
+            continue
+        seen = (journey.signs.corners_px, journey.lane_points.px, journey.T_world_camera)
+        key = b"".join(part.cpu().numpy().tobytes() for part in seen)
+        known = first.setdefault(key, journey.journey_id)
+        if known != journey.journey_id:
+            yield (
+                journey.journey_id,
+                Finding(
+                    "copies",
+                    f"poses and detections are those of {known!r}",
+                    "one drive was uploaded more than once",
+                    "remove the copies: the map takes each for a drive of its own",
+                ),
+            )

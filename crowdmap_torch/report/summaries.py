@@ -1,0 +1,133 @@
+"""What a run took, left out and found, stage by stage and journey by journey: for metrics.json and the report."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.io.truth import Truth
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.tables import Dataset, RejectedJourney
+
+
+@dataclass(frozen=True)
+class JourneySummary:
+    """What is told of one journey in use."""
+
+    journey_id: str
+    frames: int
+    detections: int
+    """Of signs."""
+    used: int
+    """Sign detections that are in a landmark of the map."""
+    signs: int
+    """Signs of its own triangulation."""
+    bias: tuple[float, float, float]
+    """East, north, up: adjusted minus given position, in the mean along the way [m]; NaN if it had no say."""
+    bias_sigma: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    heading_deg: float = math.nan
+    """The same of the heading, counted from east to north."""
+    heading_sigma_deg: float = math.nan
+    true_bias: tuple[float, float, float] | None = None
+    """The same against the true poses (simulated data only)."""
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """How many of what were left out where, and why."""
+
+    stage: str
+    reason: str
+    count: int
+
+
+def outlier_journeys_of(dataset: Dataset, result: MapResult) -> tuple[RejectedJourney, ...]:
+    """Journeys that do not fit the others, with the reason."""
+    return tuple(
+        RejectedJourney(dataset.journeys[found.journey].journey_id, found.reason)
+        for found in result.first.crowd.report.outlier_journeys
+    )
+
+
+def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict[str, int]:
+    """What each stage took and left, in the order of the stages."""
+    maps, first = result.journey_maps, result.first
+    signs = result.hd_map.signs
+    return {
+        "journeys": len(dataset.journeys),
+        "journeys set aside": len(dataset.rejected),
+        "frames": sum(j.frame_count for j in dataset.journeys),
+        "sign detections": sum(len(j.signs) for j in dataset.journeys),
+        "lane detections": sum(len(j.lanes) for j in dataset.journeys),
+        "sign tracklets": sum(m.sign_tracklets.count for m in maps),
+        "signs of single journeys": sum(len(m.signs) for m in maps),
+        "lane pieces of single journeys": sum(len(m.lanes) for m in maps),
+        "sign clusters": len(first.signs),
+        "single signs": len(first.tentative),
+        "sign detections brought back": first.completed.fitting + first.completed.displaced
+        if first.completed
+        else 0,
+        "sign detections used": sum(int((a.sign >= 0).sum()) for a in result.associations),
+        "lane detections used": sum(int((a.lane >= 0).sum()) for a in result.associations),
+        "control points": result.control_points,
+        "signs of the map": int((signs.confidence >= config.min_confidence).sum()),
+        "tentative signs": int((signs.confidence < config.min_confidence).sum()),
+        "lanes of the map": len(result.hd_map.lanes),
+    }
+
+
+def pruned_of(dataset: Dataset, result: MapResult) -> tuple[Pruned, ...]:
+    """What was left out, by stage and reason."""
+    totals: Counter[tuple[str, str]] = Counter()
+    for journey, made in zip(dataset.journeys, result.journey_maps, strict=True):
+        for reason, count in journey.dropped.items():
+            totals["detections at the door", reason] += count
+        for reason, count in made.sign_report.pruned.items():
+            if reason != "kept":
+                totals["sign tracklets", reason] += count
+        for reason, count in made.lane_report.pruned.items():
+            if reason != "kept":
+                totals["lane tracklets", reason] += count
+    totals["signs of single journeys", "seen by too few journeys"] = len(result.first.tentative)
+    return tuple(Pruned(stage, why, count) for (stage, why), count in totals.items() if count)
+
+
+def journey_summaries(
+    dataset: Dataset, result: MapResult, truth: Truth | None = None
+) -> tuple[JourneySummary, ...]:
+    """One line for each journey in use."""
+    summaries = []
+    true: Sequence[tuple[float, float, float] | None] = [None] * len(dataset.journeys)
+    if truth is not None:
+        # A bias is what is to be added to the given positions.
+        true = [(-x, -y, -z) for x, y, z in (t.mean_error_m.tolist() for t in truth.journeys)]
+    found = result.uncertainty
+    sigmas = found.bias_covariance.diagonal(dim1=1, dim2=2).sqrt()
+    for journey, made, association, bias, sigma, true_bias in zip(
+        dataset.journeys,
+        result.journey_maps,
+        result.associations,
+        found.bias.tolist(),
+        sigmas.tolist(),
+        true,
+        strict=True,
+    ):
+        east, north, up, heading = bias
+        summaries.append(
+            JourneySummary(
+                journey_id=journey.journey_id,
+                frames=journey.frame_count,
+                detections=len(journey.signs),
+                used=int((association.sign >= 0).sum()),
+                signs=len(made.signs),
+                bias=(east, north, up),
+                bias_sigma=(sigma[0], sigma[1], sigma[2]),
+                heading_deg=math.degrees(heading),
+                heading_sigma_deg=math.degrees(sigma[3]),
+                true_bias=true_bias,
+            )
+        )
+    return tuple(summaries)

@@ -1,0 +1,1 @@
+"""Residuals of single observations, each readable beside its equation, and their Jacobians (V-B, eq:ba)."""

@@ -1,0 +1,174 @@
+"""What holds camera poses: the positioning module's word, odometry, and the drift between them (V-B, footnote).
+
+Errors of poses are tangents of geometry.se3: translation along the world axes [m], rotation about the body axes [rad].
+As in `reprojection`: a residual for one observation, which many pass through with the rows last, and its Jacobians.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.optim.linearize import sum_of_products
+from crowdmap_torch.optim.problem import Jacobian, SparseJacobian
+from crowdmap_torch.residuals.reprojection import components
+
+
+def pose_prior(
+    T_world_camera: Float[Tensor, "4 4 *#rows"], prior: Float[Tensor, "4 4 *#rows"]
+) -> Float[Tensor, "6 *#rows"]:
+    """Deviation of a pose from its prior: along the world axes, and about the body axes (V-B, footnote)."""
+    turn = _turn(prior, T_world_camera)
+    return torch.cat((T_world_camera[:3, 3] - prior[:3, 3], _log(turn)))
+
+
+def pose_deviation(
+    T_world_camera: Float[Tensor, "4 4 *#rows"],
+    drift: Float[Tensor, "6 *#rows"],
+    prior: Float[Tensor, "4 4 *#rows"],
+) -> Float[Tensor, "6 *#rows"]:
+    """What is left of a frame's pose error after the slow drift: the module's white noise (V-B, footnote).
+
+    The error is the tangent from the prior pose to the pose. Absolute regularisation acts through the drift, relative
+    regularisation between frames through the chain that the drift forms.
+    """
+    return pose_prior(T_world_camera, prior) - drift
+
+
+def relative_pose(
+    T_world_from: Float[Tensor, "4 4 *#rows"],
+    T_world_to: Float[Tensor, "4 4 *#rows"],
+    measured: Float[Tensor, "4 4 *#rows"],
+) -> Float[Tensor, "6 *#rows"]:
+    """Deviation of a relative pose from the `measured` pose of the second frame in the first (V-B, footnote)."""
+    R_from_to, step = _step(T_world_from, T_world_to)
+    return torch.cat((step - measured[:3, 3], _log(_turn(measured, R_from_to))))
+
+
+def gauss_markov_start(
+    state: Float[Tensor, "k *#rows"], mean: Float[Tensor, "k *#rows"]
+) -> Float[Tensor, "k *#rows"]:
+    """How far the first state of a Gauss-Markov chain is from its mean: a journey's drift from its constant bias."""
+    return state - mean
+
+
+def gauss_markov_step(
+    before: Float[Tensor, "k *#rows"],
+    after: Float[Tensor, "k *#rows"],
+    mean: Float[Tensor, "k *#rows"],
+    keep: Float[Tensor, "k *#rows"],
+) -> Float[Tensor, "k *#rows"]:
+    """Innovation of a Gauss-Markov chain from one place to the next, which the share `keep` of what was is left at."""
+    return after - mean - keep * (before - mean)
+
+
+def sideways_parting(
+    before: Float[Tensor, "k *#rows"],
+    after: Float[Tensor, "k *#rows"],
+    seen: Float[Tensor, "*#rows"],
+    by_before: Float[Tensor, "k *#rows"],
+    by_after: Float[Tensor, "k *#rows"],
+) -> Float[Tensor, "1 *#rows"]:
+    """How far measured and reckoned path part sideways from knot to knot, once drift and slip are taken off [m]."""
+    return seen + (by_before * before + by_after * after).sum(0, keepdim=True)
+
+
+def pose_prior_jacobian(
+    T_world_camera: Float[Tensor, "4 4 m"], prior: Float[Tensor, "4 4 m"]
+) -> tuple[Float[Tensor, "6 m"], tuple[SparseJacobian]]:
+    """`pose_prior` and its Jacobian by the pose."""
+    error = pose_prior(T_world_camera, prior)
+    moved = SparseJacobian.diagonal(torch.ones_like(error[:3])).rows
+    turned = ((3, row) for row in se3.right_jacobian_inverse(error[3:]))
+    return error, (SparseJacobian(6, (*moved, *turned)),)
+
+
+def pose_deviation_jacobian(
+    T_world_camera: Float[Tensor, "4 4 m"],
+    drift: Float[Tensor, "6 m"],
+    prior: Float[Tensor, "4 4 m"],
+) -> tuple[Float[Tensor, "6 m"], tuple[Jacobian, Jacobian]]:
+    """`pose_deviation` and its Jacobians by pose and drift."""
+    error, (by_pose,) = pose_prior_jacobian(T_world_camera, prior)
+    return error - drift, (by_pose, SparseJacobian.diagonal(-torch.ones_like(drift)))
+
+
+def relative_pose_jacobian(
+    T_world_from: Float[Tensor, "4 4 m"],
+    T_world_to: Float[Tensor, "4 4 m"],
+    measured: Float[Tensor, "4 4 m"],
+) -> tuple[Float[Tensor, "6 m"], tuple[Jacobian, Jacobian]]:
+    """`relative_pose` and its Jacobians by the two poses."""
+    R_from_to, step = _step(T_world_from, T_world_to)
+    error = torch.cat((step - measured[:3, 3], _log(_turn(measured, R_from_to))))
+    A, B = T_world_from[:3, :3].transpose(0, 1), se3.right_jacobian_inverse(error[3:])
+    C = -sum_of_products(B.transpose(0, 1), R_from_to.transpose(0, 1))
+    # A turn w of the first frame moves the step by step x w.
+    (x, y, z), none = step, torch.zeros_like(step[0])
+    swung = torch.stack((none, -z, y, z, none, -x, -y, x, none)).unflatten(0, (3, 3))
+    by_from = (*((0, row) for row in torch.cat((-A, swung), dim=1)), *((3, row) for row in C))
+    by_to = (*((0, row) for row in A), *((3, row) for row in B))
+    return error, (SparseJacobian(6, by_from), SparseJacobian(6, by_to))
+
+
+def gauss_markov_start_jacobian(
+    state: Float[Tensor, "k m"], mean: Float[Tensor, "k m"]
+) -> tuple[Float[Tensor, "k m"], tuple[Jacobian, Jacobian]]:
+    """`gauss_markov_start` and its Jacobians by state and mean."""
+    one = torch.ones_like(state)
+    return state - mean, (SparseJacobian.diagonal(one), SparseJacobian.diagonal(-one))
+
+
+def gauss_markov_step_jacobian(
+    before: Float[Tensor, "k m"],
+    after: Float[Tensor, "k m"],
+    mean: Float[Tensor, "k m"],
+    keep: Float[Tensor, "k m"],
+) -> tuple[Float[Tensor, "k m"], tuple[Jacobian, ...]]:
+    """`gauss_markov_step` and its Jacobians by the two states and the mean."""
+    by = (-keep, torch.ones_like(keep), keep - 1)
+    error = gauss_markov_step(before, after, mean, keep)
+    return error, tuple(SparseJacobian.diagonal(entries) for entries in by)
+
+
+def sideways_parting_jacobian(
+    before: Float[Tensor, "k m"],
+    after: Float[Tensor, "k m"],
+    seen: Float[Tensor, " m"],
+    by_before: Float[Tensor, "k m"],
+    by_after: Float[Tensor, "k m"],
+) -> tuple[Float[Tensor, "1 m"], tuple[Tensor, Tensor]]:
+    """`sideways_parting` and its Jacobians by the drift at the two knots."""
+    error = sideways_parting(before, after, seen, by_before, by_after)
+    return error, (by_before[None], by_after[None])
+
+
+def _step(
+    T_world_from: Float[Tensor, "4 4 *#rows"], T_world_to: Float[Tensor, "4 4 *#rows"]
+) -> tuple[Float[Tensor, "3 3 *#rows"], Float[Tensor, "3 *#rows"]]:
+    """Rotation and translation of the second frame in the first."""
+    step = components(T_world_from[:3, :3], T_world_to[:3, 3] - T_world_from[:3, 3])
+    return _turn(T_world_from, T_world_to), step
+
+
+def _turn(
+    T_world_from: Float[Tensor, "_ _ *#rows"], T_world_to: Float[Tensor, "_ _ *#rows"]
+) -> Float[Tensor, "3 3 *#rows"]:
+    """Rotation of the second frame in the first."""
+    return components(T_world_from[:3, :3, None], T_world_to[:3, None, :3])
+
+
+def _log(R: Float[Tensor, "3 3 *#rows"]) -> Float[Tensor, "3 *#rows"]:
+    """`se3.so3_log`, rows last; of many rotations in half the time where none of them is near half a turn."""
+    # R - R^T is twice the sine of the angle about the axis: sound up to a right angle.
+    twice = torch.stack((R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]))
+    cosine = (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2
+    # One alone may stand for many under `vmap`, where nothing can be asked of its value.
+    if R.ndim == 2 or bool((cosine < 0.1).any()):
+        return se3.so3_log(R.movedim((0, 1), (-2, -1))).movedim(-1, 0)
+    square = twice.square().sum(0)
+    small = square < 4e-8
+    sine = torch.where(small, 1.0, square).sqrt() / 2
+    return twice / 2 * torch.where(small, 1 + square / 24, torch.atan2(sine, cosine) / sine)

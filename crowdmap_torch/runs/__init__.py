@@ -1,0 +1,1 @@
+"""What a run writes: its folder, with everything that FORMAT.md names, and metrics.json."""

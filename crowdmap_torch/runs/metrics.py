@@ -1,0 +1,82 @@
+"""metrics.json: what a run says of itself in numbers (FORMAT.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.evaluation.map_figures import MapFigures
+from crowdmap_torch.geometry import polygon
+from crowdmap_torch.geometry.trajectory import station
+from crowdmap_torch.io.documents import plain
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.report.iteration import Iteration
+from crowdmap_torch.report.summaries import (
+    counts_of,
+    journey_summaries,
+    outlier_journeys_of,
+    pruned_of,
+)
+from crowdmap_torch.tables import Dataset
+
+
+def metrics_of(
+    dataset: Dataset,
+    result: MapResult,
+    config: MapperConfig,
+    iterations: Sequence[Iteration],
+    seconds: Mapping[str, float],
+    figures: MapFigures | None,
+    figures_before: MapFigures | None,
+) -> dict[str, object]:
+    """metrics.json (FORMAT.md)."""
+    drive = {j.journey_id: float(station(j.T_world_camera)[-1]) for j in dataset.journeys}
+    summaries = journey_summaries(dataset, result)
+    return {
+        "counts": counts_of(dataset, result, config),
+        "pruned": plain(pruned_of(dataset, result)),
+        "times_s": dict(seconds),
+        "costs": [
+            {"iteration": i.number, "accepted": i.accepted, "total": i.total, **i.cost}
+            for i in iterations
+        ],
+        "outcome": result.state.reasons[0],
+        "rejected_journeys": plain(dataset.rejected),
+        "suspect_journeys": plain(outlier_journeys_of(dataset, result)),
+        "journeys": [
+            {
+                "journey_id": s.journey_id,
+                "frames": s.frames,
+                "length_m": drive[s.journey_id],
+                "sign_detections": s.detections,
+                "sign_detections_used": s.used,
+                "signs": s.signs,
+                "bias_m": s.bias,
+                "bias_covariance": covariance[:3, :3].flatten(),
+                "heading_deg": s.heading_deg,
+                "heading_sigma_deg": s.heading_sigma_deg,
+                "sigma_scale": dict(zip(("bias", "drift", "rotation"), scale, strict=True)),
+            }
+            for s, covariance, scale in zip(
+                summaries,
+                result.uncertainty.bias_covariance,
+                result.prior_scale.tolist(),
+                strict=True,
+            )
+        ],
+        "sign_corners": _corner_covariances(result),
+        "survey": None if figures is None else figures.as_dict(),
+        "survey_clusters": None if figures_before is None else figures_before.as_dict(),
+    }
+
+
+def _corner_covariances(result: MapResult) -> list[dict[str, object]]:
+    """Of every adjusted sign the covariances of its corners, nine numbers each [m^2], in the order of the map's."""
+    signs, covariance = result.hd_map.signs, result.uncertainty.corner.flatten(2)
+    count = polygon.corner_count(signs.shape[: len(covariance)]).tolist()
+    return [
+        {"sign_id": name, "covariance": of_corner[:corners]}
+        for name, of_corner, corners in zip(
+            result.hd_map.sign_id, covariance.tolist(), count, strict=False
+        )
+    ]

@@ -1,0 +1,1 @@
+"""Signs of one drive: triangulation (IV-B)."""

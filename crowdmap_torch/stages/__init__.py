@@ -1,1 +1,0 @@
-"""The stages of the mapping pipeline, one module each."""

@@ -1,0 +1,1 @@
+"""Detections of one drive told apart, frame after frame (IV-A)."""

@@ -1,0 +1,218 @@
+"""IV-A, lanes: what association needs of detections, and the costs of pairs: batched, whatever the frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry.epipolar import epipolar_cost, fundamental
+from crowdmap_torch.tables import LaneDetections, LanePoints, Rig, Rows
+
+METHODS = ("ground", "epipolar")
+SAMPLES = 6
+"""Points by which a detection's line is compared."""
+
+
+@dataclass(frozen=True)
+class LaneAssociationConfig:
+    """How lane detections become tracklets (IV-A)."""
+
+    method: str = "ground"
+    """`ground`: sideways distance on the calibrated road plane; `epipolar`: the paper's cost of an image line."""
+    window_frames: int = 25
+    """Tracklets silent for longer are ignored: the association window."""
+    unmatched_cost: float = 9.0
+    """`ground`: a detection that costs more, mean square in standard deviations, starts a tracklet."""
+    max_epipolar_px: float = 12.0
+    """`epipolar`: root mean square epipolar distance beyond which a detection starts a tracklet."""
+    sigma_m: float = 0.2
+    """Sideways noise of a line near the car."""
+    sigma_per_m: float = 0.012
+    """Growth of that noise with the distance ahead."""
+    turn_sigma_per_m: float = 0.03
+    """Growth of the noise beyond the end of the line that is compared with."""
+    max_beyond_m: float = 25.0
+    """Lines with a longer gap between them, along the road, are not compared."""
+    type_penalty: float = 2.0
+    """Cost of another type where both are known."""
+    reach_m: tuple[float, float] = (2.0, 45.0)
+    """Points nearer or further ahead on the road plane are left out."""
+    chunk_pairs: int = 1 << 13
+    """Pairs whose costs are computed at once."""
+
+    def __post_init__(self) -> None:
+        """Refuses an unknown method."""
+        if self.method not in METHODS:
+            raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
+
+
+@dataclass(frozen=True)
+class LaneFeatures(Rows):
+    """What association needs of each lane detection."""
+
+    frame: Int[Tensor, " d"]
+    type: Int[Tensor, " d"]
+    curve: Float[Tensor, "d 3"]
+    """Sideways place `c0 + c1 x + c2 x^2` on the road plane, x metres ahead; left is positive."""
+    extent: Float[Tensor, "d 2"]
+    """Nearest and furthest x."""
+    T_world_road: Float[Tensor, "d 4 4"]
+    """Road frame: under the camera, x ahead, y left, z up."""
+    line_ideal: Float[Tensor, "d s 2"]
+    """Samples of the straight line through the detection's image points, on the plane z = 1."""
+    focal: Float[Tensor, " d"]
+    T_world_camera: Float[Tensor, "d 4 4"]
+
+
+def lane_features(
+    detections: LaneDetections,
+    points: LanePoints,
+    rig: Rig,
+    T_world_camera: Float[Tensor, "d 4 4"],
+    config: LaneAssociationConfig,
+) -> LaneFeatures:
+    """Lines through lane detections, on the calibrated road plane and in the image."""
+    T_camera_road = _road_axes(rig)
+    ray = torch.nn.functional.pad(points.ideal, (0, 1), value=1.0)
+    ray_road = ray @ T_camera_road[:3, :3]
+    below = -ray_road[:, 2]
+    depth = rig.camera_height / below.clamp_min(1e-4)
+    x, y = (ray_road[:, :2] * depth[:, None]).unbind(-1)
+    near, far = config.reach_m
+    on_road = (below > 1e-4) & (x > near) & (x < far)
+    # A pixel at x metres is x^2 / (f h) metres along the road, and aside in the same proportion.
+    sigma = config.sigma_m + config.sigma_per_m * x.clamp(near, far)
+    count = len(detections)
+    curve, extent = _fit_curves(
+        x[on_road], y[on_road], sigma[on_road], points.detection[on_road], count
+    )
+    focal = rig.camera.K[0, 0].expand(count)
+    return LaneFeatures(
+        frame=detections.frame,
+        type=detections.type,
+        curve=curve,
+        extent=extent,
+        T_world_road=T_world_camera @ T_camera_road,
+        line_ideal=_image_lines(points, count),
+        focal=focal,
+        T_world_camera=T_world_camera,
+    )
+
+
+def _road_axes(rig: Rig) -> Float[Tensor, "4 4"]:
+    """`T_camera_road` of the calibrated road: its origin under the camera, x ahead, y left, z up."""
+    up = -rig.road_normal_camera
+    ahead = torch.zeros_like(up)
+    ahead[2] = 1
+    ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
+    left = torch.linalg.cross(up, ahead)
+    # Rays start at the camera: the frame's axes are the road's, its origin is the camera's.
+    return se3.make(torch.stack((ahead, left, up), dim=-1), torch.zeros_like(up))
+
+
+def lane_pair_costs(
+    a: LaneFeatures, b: LaneFeatures, config: LaneAssociationConfig
+) -> Float[Tensor, " p"]:
+    """Cost of linking each lane detection of `a` with the later one of `b` in the same row."""
+    if config.method == "epipolar":
+        return _epipolar_costs(a, b)
+    cost = _ground_costs(a, b, config)
+    differs = (a.type != b.type) & (a.type >= 0) & (b.type >= 0)
+    return cost + config.type_penalty * differs
+
+
+def _ground_costs(
+    a: LaneFeatures, b: LaneFeatures, config: LaneAssociationConfig
+) -> Float[Tensor, " p"]:
+    """Mean squared sideways distance of `b`'s line from `a`'s on the road, in standard deviations."""
+    share = torch.linspace(0, 1, SAMPLES, dtype=b.extent.dtype, device=b.extent.device)
+    near, far = b.extent[:, :1], b.extent[:, 1:]
+    x = near + (far - near).clamp_max(25.0) * share
+    y = _sideways(b.curve, x)
+    # The points are on the road's plane, and what matters of them in the other frame is x and y.
+    T_a_b = (se3.inverse(a.T_world_road) @ b.T_world_road)[:, :2, :, None]
+    ahead, sideways = (row[:, 0] * x + row[:, 1] * y + row[:, 3] for row in T_a_b.unbind(1))
+    low, high = a.extent[:, :1], a.extent[:, 1:]
+    inside = torch.minimum(torch.maximum(ahead, low), high)
+    beyond = (ahead - inside).abs()
+    # Beyond its ends the line goes on straight.
+    slope = a.curve[:, 1:2] + 2 * a.curve[:, 2:] * inside
+    expected = _sideways(a.curve, inside) + slope * (ahead - inside)
+    sigma = config.sigma_m + config.sigma_per_m * x + config.turn_sigma_per_m * beyond
+    error = ((sideways - expected) / sigma).square()
+    usable = beyond < config.max_beyond_m
+    count = usable.sum(-1)
+    cost = (error * usable).sum(-1) / count.clamp_min(1)
+    is_line = (a.extent[:, 1] > 0) & (b.extent[:, 1] > 0) & (count > 0)
+    return torch.where(is_line, cost, torch.inf)
+
+
+def _epipolar_costs(a: LaneFeatures, b: LaneFeatures) -> Float[Tensor, " p"]:
+    """The paper's cost [px^2]: mean epipolar cost of points sampled from the image lines (IV-A).
+
+    Unlike the paper, the mean and not the sum, so that the threshold does not depend on the number of samples.
+    """
+    F = fundamental(a.T_world_camera, b.T_world_camera)
+    cost = epipolar_cost(F[:, None], a.line_ideal, b.line_ideal)
+    return cost.mean(-1) * b.focal.square()
+
+
+def _sideways(curve: Float[Tensor, "p 3"], x: Float[Tensor, "p s"]) -> Float[Tensor, "p s"]:
+    return curve[:, :1] + curve[:, 1:2] * x + curve[:, 2:] * x.square()
+
+
+def _fit_curves(
+    x: Float[Tensor, " m"],
+    y: Float[Tensor, " m"],
+    sigma: Float[Tensor, " m"],
+    detection: Int[Tensor, " m"],
+    count: int,
+) -> tuple[Float[Tensor, "d 3"], Float[Tensor, "d 2"]]:
+    """Parabolas through the points of each detection, robust to outlier points, and the reach of their inliers."""
+    basis = torch.stack((torch.ones_like(x), x, x.square()), dim=-1)
+    # Markers go roughly ahead and bend with radii above some fifty metres.
+    prior = torch.diag(1 / x.new_tensor([30.0, 0.5, 0.01]).square())
+    weight = 1 / sigma.square()
+    curve = x.new_zeros(count, 3)
+    inlier = torch.ones_like(x, dtype=torch.bool)
+    for iteration in range(6):
+        normal = prior.expand(count, 3, 3).clone()
+        right = x.new_zeros(count, 3)
+        normal.index_add_(0, detection, weight[:, None, None] * basis[:, :, None] * basis[:, None])
+        right.index_add_(0, detection, (weight * y)[:, None] * basis)
+        curve = torch.linalg.solve(normal, right[..., None])[..., 0]
+        error = ((basis * curve[detection]).sum(-1) - y).abs() / sigma
+        # First the absolute error, then only what lies near the line.
+        inlier = error < 3.0
+        robust = 1 / error.clamp_min(0.5) if iteration < 4 else inlier.to(x)
+        weight = robust / sigma.square()
+    used = detection[inlier]
+    nearest = x.new_full((count,), torch.inf).scatter_reduce(0, used, x[inlier], "amin")
+    furthest = x.new_full((count,), -1.0).scatter_reduce(0, used, x[inlier], "amax")
+    seen = furthest > 0
+    nearest = torch.where(seen, nearest, -1.0)
+    return curve, torch.stack((nearest, furthest), dim=-1)
+
+
+def _image_lines(points: LanePoints, count: int) -> Float[Tensor, "d s 2"]:
+    """Points spaced evenly along the line through the image points of each detection."""
+    ideal, detection = points.ideal, points.detection
+    number = torch.bincount(detection, minlength=count).clamp_min(1).to(ideal)[:, None]
+    mean = ideal.new_zeros(count, 2).index_add_(0, detection, ideal) / number
+    offset = ideal - mean[detection]
+    scatter = ideal.new_zeros(count, 2, 2)
+    scatter.index_add_(0, detection, offset[:, :, None] * offset[:, None])
+    direction = torch.linalg.eigh(scatter).eigenvectors[..., 1]
+    along = (offset * direction[detection]).sum(-1)
+    low = ideal.new_zeros(count).scatter_reduce(0, detection, along, "amin")
+    high = ideal.new_zeros(count).scatter_reduce(0, detection, along, "amax")
+    # An eigenvector is free in sign: lines start at their lower end in the image.
+    flip = direction[:, 1] < 0
+    low, high = torch.where(flip, high, low), torch.where(flip, low, high)
+    share = torch.linspace(0, 1, SAMPLES, dtype=ideal.dtype, device=ideal.device)
+    place = low[:, None] + (high - low)[:, None] * share
+    return mean[:, None] + place[..., None] * direction[:, None]

@@ -1,0 +1,53 @@
+"""The bundle's problem: there from the start, and of the matches and scales of the moment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.mapper import MapResult, build_bundle
+from crowdmap_torch.optim.linearize import term_costs
+from crowdmap_torch.tables import Dataset
+
+
+@pytest.fixture(scope="module")
+def build(tiny: Dataset, tiny_result: MapResult) -> Callable[[], Bundle]:
+    """Three journeys with a frame every six metres."""
+    config = MapperConfig()
+    config = replace(config, adjust=replace(config.adjust, frame_spacing_m=6.0))
+    return lambda: build_bundle(tiny.journeys, tiny_result.journey_maps, tiny_result.first, config)
+
+
+def costs(bundle: Bundle) -> dict[str, float]:
+    with torch.no_grad():
+        by_term = term_costs(bundle.problem(), bundle.values())
+    return {name: float(cost) for name, cost in by_term.items()}
+
+
+def test_the_problem_is_there_before_the_first_refresh(build: Callable[[], Bundle]):
+    fresh, refreshed = build(), build()
+    refreshed.refresh()
+    found = costs(fresh)
+    assert found == costs(refreshed)
+    assert {"sign_reprojection", "lane_reprojection", "lane_slide"} <= found.keys()
+    assert torch.equal(fresh.scale, refreshed.scale) and fresh.scale.isfinite().all()
+
+
+def test_asking_again_changes_nothing(build: Callable[[], Bundle]):
+    bundle = build()
+    assert costs(bundle) == costs(bundle)
+
+
+def test_a_bundle_that_was_loaded_finds_its_matches_first(build: Callable[[], Bundle]):
+    saved, loaded = build(), build()
+    saved.refresh()
+    loaded.problem()
+    loaded.load_state_dict(saved.state_dict())
+    assert not loaded.is_refreshed
+    saved.refresh()
+    assert costs(loaded) == costs(saved)

@@ -1,0 +1,186 @@
+"""Covariances of an adjusted map against the inverse of the whole dense system."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.func import jacfwd
+
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.geometry import polygon, se3, spline_basis
+from crowdmap_torch.mapper import MapResult, build_bundle
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim.problem import positive
+from crowdmap_torch.optim.solvers.conjugate_gradient import (
+    ConjugateGradientBackend,
+    ConjugateGradientEquations,
+)
+from crowdmap_torch.optim.solvers.dense import DenseBackend
+from crowdmap_torch.tables import Dataset
+
+
+@pytest.fixture(scope="module")
+def bundle(tiny: Dataset, tiny_result: MapResult) -> Bundle:
+    """Three journeys with a frame every six metres."""
+    config = MapperConfig()
+    config = replace(config, adjust=replace(config.adjust, frame_spacing_m=6.0))
+    maps, first = tiny_result.journey_maps, tiny_result.first
+    built = build_bundle(tiny.journeys, maps, first, config)
+    adjust.start(built)
+    return built
+
+
+@pytest.fixture(scope="module")
+def found(bundle: Bundle, tiny_result: MapResult) -> MapUncertainty:
+    return map_uncertainty(bundle, tiny_result.first.signs, tiny_result.first.lanes)
+
+
+@pytest.fixture(scope="module")
+def dense(bundle: Bundle):
+    """Joint covariance of all unknowns, and the columns of each variable's blocks."""
+    with torch.no_grad():
+        values = bundle.values()
+        scale = bundle.prior.expected_scale(values["drift"], bundle.prior_scale)
+        problem = bundle.information(scale)
+        normal = DenseBackend().assemble(problem, values)
+        covariance = normal.covariance(floor=1e-9).matrix[0]
+
+    def columns(name: str) -> Tensor:
+        where = normal.where
+        return where.offset[name][:, None] + torch.arange(where.tangent_dim[name])
+
+    return covariance, columns
+
+
+def test_centres_and_what_they_share_are_blocks_of_the_inverse(found: MapUncertainty, dense):
+    covariance, columns = dense
+    at = columns("sign")[:, :3]
+    expected = covariance[at[:, :, None], at[:, None]]
+    torch.testing.assert_close(found.center, expected, rtol=1e-5, atol=1e-9)
+    rows = at.flatten()
+    joint = covariance[rows][:, rows]
+    alike = torch.eye(3, dtype=torch.float64).repeat(len(at), 1)
+    left = joint - alike @ found.shared @ alike.mT
+    value, vector = torch.linalg.eigh(left)
+    # What is left is a covariance, and no more can be taken off: three of its directions are used up.
+    assert (value[:3].abs() < 1e-5 * value[-1]).all() and (value[3:] > 0).all()
+    more = joint - 1.001 * alike @ found.shared @ alike.mT
+    assert ((vector[:, :3].mT @ more @ vector[:, :3]).diagonal() < 0).all()
+
+
+def test_corners_follow_from_pose_and_size(
+    bundle: Bundle, found: MapUncertainty, dense, tiny_result: MapResult
+):
+    covariance, columns = dense
+    values, shape = bundle.values(), tiny_result.first.signs.shape
+    at = torch.cat((columns("sign"), columns("size")), dim=1)
+    for k in range(len(shape)):
+        T, size = values["sign"][k : k + 1], values["size"][k : k + 1]
+        _, _, shift = polygon.canonical_with_shift(T, size, shape[k : k + 1])
+
+        def corners(tangent: Tensor, T=T, size=size, k=k) -> Tensor:
+            moved = se3.retract(T, tangent[None, :6])
+            sides = positive(size, tangent[None, 6:])
+            return se3.transform(moved[:, None], polygon.corners(shape[k : k + 1], sides))[0]
+
+        J = jacfwd(corners)(torch.zeros(8, dtype=torch.float64))
+        expected = J @ covariance[at[k]][:, at[k]] @ J.mT
+        count = int(polygon.corner_count(shape[k]))
+        order = (torch.arange(count) + shift) % count
+        torch.testing.assert_close(found.corner[k, :count], expected[order], rtol=1e-5, atol=1e-9)
+
+
+def test_lane_sigmas_are_of_points_on_the_spline(
+    bundle: Bundle, found: MapUncertainty, dense, tiny_result: MapResult
+):
+    covariance, columns = dense
+    at = columns("lane")
+    across = bundle.fixed["lane_prior"].constants[1][:, :, 1]
+    count = tiny_result.first.lanes.control_count
+    start = 0
+    for c in count.tolist():
+        coefficient = torch.eye(c, dtype=torch.float64)
+        weight = spline_basis.from_coefficients_flat(coefficient, torch.tensor([c]))
+        mine = slice(start, start + c)
+        start += c
+        for k in range(c):
+            push = (weight[k][:, None] * across[mine][k]).flatten()
+            own = at[mine].flatten()
+            variance = push @ covariance[own][:, own] @ push
+            assert float(found.lane_sigma[mine][k] ** 2) == pytest.approx(float(variance), rel=1e-4)
+
+
+def test_biases_are_means_of_the_drift_along_the_way(bundle: Bundle, found: MapUncertainty, dense):
+    covariance, columns = dense
+    nodes, values = bundle.prior.nodes, bundle.values()
+    at = columns("drift")
+    for journey in range(3):
+        mine = torch.nonzero(nodes.journey == journey)[:, 0]
+        R = values["pose"][nodes.first[mine], :3, :3]
+        turn = (R @ values["drift"][mine, 3:, None])[:, 2, 0]
+        mean = torch.cat((values["drift"][mine, :3].mean(0), turn.mean()[None]))
+        torch.testing.assert_close(found.bias[journey], mean)
+        push = torch.zeros(len(mine), 6, 4, dtype=torch.float64)
+        push[:, :3, :3] = torch.eye(3)
+        push[:, 3:, 3] = R[:, 2]
+        push = push.flatten(0, 1) / len(mine)
+        own = at[mine].flatten()
+        expected = push.mT @ covariance[own][:, own] @ push
+        torch.testing.assert_close(found.bias_covariance[journey], expected, rtol=1e-5, atol=1e-10)
+
+
+def test_a_journey_without_a_say_has_no_bias(tiny: Dataset, tiny_result: MapResult):
+    first = tiny_result.first
+    roads = [m.road for m in tiny_result.journey_maps]
+    built = adjust.build(
+        tiny.journeys,
+        roads,
+        first.signs,
+        first.lanes,
+        first.associations,
+        first.drifts,
+        PositioningNoise(),
+        replace(MapperConfig().adjust, frame_spacing_m=6.0),
+        left_out=(1,),
+    )
+    adjust.start(built)
+    found = map_uncertainty(built, first.signs, first.lanes)
+    assert found.bias[1].isnan().all() and found.bias_covariance[1].isnan().all()
+    assert found.bias[[0, 2]].isfinite().all()
+    assert (torch.linalg.eigvalsh(found.bias_covariance[[0, 2]]) > 0).all()
+
+
+def test_of_a_large_map_all_is_read_from_samples(
+    bundle: Bundle, found: MapUncertainty, dense, tiny_result: MapResult, monkeypatch
+):
+    covariance, columns = dense
+    # As many as there are unknowns, and such that their covariance is the exact one.
+    root = torch.linalg.cholesky(covariance) * len(covariance) ** 0.5
+    drawn = {name: root[columns(name)] for name in bundle.names}
+    monkeypatch.setattr(bundle, "config", replace(bundle.config, dense_unknowns=0))
+    monkeypatch.setattr(ConjugateGradientEquations, "samples", lambda *_, **__: drawn)
+    sampled = map_uncertainty(bundle, tiny_result.first.signs, tiny_result.first.lanes)
+    for name in ("center", "corner", "lane_sigma", "bias", "bias_covariance"):
+        exact, other = getattr(found, name), getattr(sampled, name)
+        torch.testing.assert_close(other, exact, rtol=1e-4, atol=1e-7)
+    at = columns("sign")[:, :3]
+    over_pairs = covariance[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
+    torch.testing.assert_close(sampled.shared, over_pairs, rtol=1e-4, atol=1e-7)
+
+
+def test_conjugate_gradients_take_the_step_of_the_factors(bundle: Bundle, monkeypatch):
+    damping = torch.tensor([1e-6], dtype=torch.float64)
+    exact = bundle.backend().assemble(bundle.problem(), bundle.values()).solve(damping)
+    monkeypatch.setattr(bundle, "config", replace(bundle.config, dense_unknowns=0))
+    backend = bundle.backend()
+    assert isinstance(backend, ConjugateGradientBackend)
+    step = backend.assemble(bundle.problem(), bundle.values()).solve(damping)
+    assert bool(step.solved)
+    for name, delta in exact.delta.items():
+        torch.testing.assert_close(step.delta[name], delta, rtol=1e-4, atol=1e-6)

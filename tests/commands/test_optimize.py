@@ -1,0 +1,477 @@
+"""The main job on a small simulated street: what it writes, what it refuses, and how it goes on."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from crowdmap_torch import mapper
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.cli import main
+from crowdmap_torch.commands import optimize as optimize_command
+from crowdmap_torch.config import MapperConfig, load_config
+from crowdmap_torch.io.maps import certain_part, read_map
+from crowdmap_torch.tables import Dataset
+
+LANDMARK = {"n_journeys", "n_observations", "first_seen_ns", "last_seen_ns", "confidence"}
+SIGN = LANDMARK | {
+    *("sign_id", "shape", "type", "corners", "center", "normal", "width_m", "height_m"),
+    "covariance",
+}
+LANE = LANDMARK | {"lane_id", "type", "control_points", "points", "sigma_m"}
+
+
+@dataclass(frozen=True)
+class Said:
+    """How a run of the script ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def optimize(capsys: pytest.CaptureFixture) -> Callable[..., Said]:
+    def call(dataset: Path, out: Path, *options: str) -> Said:
+        code = main(["optimize", str(dataset), "--out", str(out), "--workers", "1", *options])
+        said = capsys.readouterr()
+        return Said(code, said.out, said.err)
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def run(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with the default configuration."""
+    out = tmp_path_factory.mktemp("run") / "run"
+    assert main(["optimize", str(tiny_folder), "--out", str(out), "--workers", "1"]) == 0
+    return out
+
+
+@pytest.fixture
+def copy(tiny_folder: Path, tmp_path: Path) -> Path:
+    """The dataset, to be spoilt."""
+    return Path(shutil.copytree(tiny_folder, tmp_path / "dataset"))
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch, tiny_result: mapper.MapResult) -> None:
+    """Takes each journey's own map from memory and draws no report: what follows them is the test's."""
+    maps = tiny_result.journey_maps
+    monkeypatch.setattr(mapper, "map_journeys", lambda journeys, *a, **k: maps[: len(journeys)])
+    monkeypatch.setattr(optimize_command, "write_report", lambda path, record: path.touch())
+
+
+def journeys_of(dataset: Path) -> list[Path]:
+    return sorted((dataset / "journeys").iterdir())
+
+
+def spoil_pose(journey: Path) -> None:
+    path = journey / "poses.parquet"
+    table = pq.read_table(path)
+    x = table["x"].to_numpy().copy()
+    x[3] = math.nan
+    pq.write_table(table.set_column(table.column_names.index("x"), "x", pa.array(x)), path)
+
+
+def swap_axes(journey: Path) -> None:
+    """Quaternions as w x y z."""
+    path = journey / "poses.parquet"
+    table = pq.read_table(path)
+    x, y, z, w = (table[name] for name in ("qx", "qy", "qz", "qw"))
+    for name, column in zip(("qx", "qy", "qz", "qw"), (w, x, y, z), strict=True):
+        table = table.set_column(table.column_names.index(name), name, column)
+    pq.write_table(table, path)
+
+
+def columns(path: Path) -> set[str]:
+    return set(pq.read_schema(path).names)
+
+
+# What a run writes.
+
+
+def test_the_board_tells_which_share_of_sign_corners_was_given_up(run: Path):
+    board = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0}).Reload()
+    share = [event.value for event in board.Scalars("robust/given_up")]
+    # None before detections are judged; of the simulation's outliers, 1 %, some are afterwards.
+    assert share[0] == 0 and 0 < share[-1] < 0.05
+
+
+def test_every_output_is_there_and_nothing_half_written(run: Path, tiny: Dataset):
+    names = {path.name for path in run.iterdir()}
+    assert names >= {
+        *("map", "map_clusters", "journeys", "associations.parquet", "metrics.json"),
+        *("report.html", "tensorboard", "config.yaml"),
+    }
+    assert not [name for name in names if name.startswith(".")]
+    assert {p.name for p in (run / "journeys").iterdir()} == {j.journey_id for j in tiny.journeys}
+    assert list((run / "tensorboard").glob("events.out.tfevents.*"))
+
+
+@pytest.mark.parametrize("name", ["map", "map_clusters"])
+def test_maps_have_the_columns_of_the_format(run: Path, tiny: Dataset, name: str):
+    folder = run / name
+    assert columns(folder / "signs.parquet") >= SIGN
+    assert columns(folder / "tentative_signs.parquet") >= SIGN
+    assert columns(folder / "lanes.parquet") >= LANE
+    head = json.loads((folder / "map.json").read_text())
+    assert head["format"] == "crowdmap-map" and head["version"] == 1
+    assert len(head["shared_covariance"]) == 9
+    assert {"version", "config", "journeys", "created_at"} <= set(head["provenance"])
+    hd_map = read_map(folder)
+    assert len(hd_map.signs) and len(hd_map.lanes) and hd_map.origin == tiny.origin
+    assert (hd_map.signs.confidence >= 0.5).all()
+
+
+def test_the_adjusted_map_knows_how_well_it_knows(run: Path):
+    hd_map = read_map(run / "map")
+    covariance = hd_map.signs.covariance
+    assert torch.allclose(covariance, covariance.mT)
+    assert (torch.linalg.eigvalsh(covariance) > 0).all()
+    assert (torch.linalg.eigvalsh(hd_map.shared_covariance) > 0).all()
+    assert (hd_map.lanes.control.sigma > 0).all()
+
+
+def test_each_journey_has_its_refined_poses_landmarks_and_road(
+    run: Path, tiny_folder: Path, tiny: Dataset
+):
+    for journey in tiny.journeys:
+        folder = run / "journeys" / journey.journey_id
+        given = pq.read_table(tiny_folder / "journeys" / journey.journey_id / "poses.parquet")
+        refined = pq.read_table(folder / "poses.parquet")
+        assert refined.column_names == given.column_names
+        for same in ("frame", "t_ns"):
+            assert refined[same].equals(given[same])
+        moved = np.stack([refined[k].to_numpy() - given[k].to_numpy() for k in "xyz"])
+        assert 0 < np.abs(moved).max() < 3
+        assert columns(folder / "signs.parquet") >= SIGN
+        assert columns(folder / "lanes.parquet") >= LANE
+        road = pq.read_table(folder / "road.parquet")
+        assert road.column_names == ["frame", "nx", "ny", "nz", "height_m", "sigma"]
+        assert road["frame"].equals(given["frame"])
+        normal = np.stack([road[f"n{k}"].to_numpy() for k in "xyz"])
+        assert np.allclose(np.linalg.norm(normal, axis=0), 1)
+
+
+def test_associations_name_a_landmark_or_none_for_every_row(run: Path, tiny_folder: Path):
+    table = pq.read_table(run / "associations.parquet")
+    assert table.column_names == ["journey_id", "kind", "row", "landmark_id"]
+    rows = sorted(zip(*(table[k].to_pylist() for k in ("journey_id", "kind", "row")), strict=True))
+    expected = [
+        (journey.name, kind, row)
+        for journey in journeys_of(tiny_folder)
+        for kind in ("sign", "lane")
+        for row in range(pq.read_metadata(journey / f"{kind}s.parquet").num_rows)
+    ]
+    assert rows == sorted(expected)
+    hd_map = read_map(run / "map")
+    named = {name for name in table["landmark_id"].to_pylist() if name is not None}
+    assert named <= set(hd_map.sign_id) | set(hd_map.lane_id)
+    # Each of them was made from detections.
+    assert named >= set(hd_map.sign_id)
+
+
+def test_metrics_tell_counts_times_costs_and_figures(run: Path):
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["rejected_journeys"] == metrics["suspect_journeys"] == []
+    assert metrics["counts"]["journeys"] == 3
+    assert metrics["counts"]["signs of the map"] == len(read_map(run / "map").signs)
+    assert all(seconds >= 0 for seconds in metrics["times_s"].values())
+    assert metrics["outcome"].startswith("converged")
+    assert {"iteration", "total", "sign_reprojection"} <= set(metrics["costs"][0])
+    assert metrics["survey"]["signs"]["recall"] > 0.8
+    assert metrics["survey_clusters"] is not None
+
+
+def test_metrics_tell_how_sure_corners_and_biases_are(run: Path):
+    metrics = json.loads((run / "metrics.json").read_text())
+    signs = {
+        row["sign_id"]: row for row in pq.read_table(run / "map" / "signs.parquet").to_pylist()
+    }
+    corners = {row["sign_id"]: row["covariance"] for row in metrics["sign_corners"]}
+    assert set(signs) <= set(corners)
+    for name, sign in signs.items():
+        assert len(corners[name]) == len(sign["corners"])
+        of_corner = torch.tensor(corners[name]).view(-1, 3, 3)
+        of_center = torch.tensor(sign["covariance"]).view(3, 3)
+        # A corner is never known better than by what the centre's bias leaves: here decimetres.
+        assert (of_corner.diagonal(dim1=1, dim2=2).sum(1) > 0.9 * of_center.trace()).all()
+    for journey in metrics["journeys"]:
+        covariance = torch.tensor(journey["bias_covariance"]).view(3, 3)
+        assert (torch.linalg.eigvalsh(covariance) > 0).all()
+        # The module's own sigma is 0.4 m, and three journeys share what nobody can tell.
+        assert (covariance.diagonal().sqrt() > 0.1).all() and covariance.trace() < 1.0
+        assert 0 < journey["heading_sigma_deg"] < 0.2
+        assert abs(journey["heading_deg"]) < 5 * journey["heading_sigma_deg"]
+        assert set(journey["sigma_scale"]) == {"bias", "drift", "rotation"}
+
+
+def test_the_report_needs_nothing_else(run: Path):
+    html = (run / "report.html").read_text(encoding="utf-8")
+    assert "<svg" in html and "<script src" not in html and 'href="http' not in html
+
+
+def test_the_configuration_is_written_with_defaults_filled_in(run: Path):
+    assert load_config(run / "config.yaml") == MapperConfig()
+    assert "adjust" in yaml.safe_load((run / "config.yaml").read_text())
+
+
+# Runs that exist.
+
+
+def test_a_run_that_exists_is_refused_and_left_alone(optimize, run: Path, tiny_folder: Path):
+    before = (run / "map" / "map.json").read_bytes()
+    said = optimize(tiny_folder, run)
+    assert said.code == 2 and "--overwrite" in said.err and said.err.count("\n") == 1
+    assert (run / "map" / "map.json").read_bytes() == before
+
+
+class Interruption(Exception):
+    """What stops a run in the middle."""
+
+
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
+    step, taken = adjust.adjust_step, []
+
+    def limited(*arguments):
+        if len(taken) == iteration:
+            raise Interruption
+        taken.append(1)
+        return step(*arguments)
+
+    monkeypatch.setattr(adjust, "adjust_step", limited)
+
+
+def test_an_interrupted_run_goes_on_where_it_was(
+    optimize,
+    quick,
+    tiny_folder: Path,
+    tmp_path: Path,
+    tiny_result: mapper.MapResult,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    out, other = tmp_path / "run", tmp_path / "other.yaml"
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 2)
+        with pytest.raises(Interruption):
+            optimize(tiny_folder, out)
+    assert (out / "checkpoint.pt").exists() and not (out / "map").exists()
+
+    # Not with another configuration.
+    other.write_text("adjust: {tukey_c: 4.0}")
+    said = optimize(tiny_folder, out, "--resume", "--config", str(other))
+    assert said.code == 2 and said.err.splitlines()[-1].startswith("crowdmap optimize: ")
+    assert "configuration" in said.err and "--overwrite" in said.err
+
+    said = optimize(tiny_folder, out, "--resume")
+    assert said.code == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["costs"][0]["iteration"] == 3
+    assert metrics["outcome"].startswith("converged")
+    whole = certain_part(tiny_result.hd_map, 0.5)
+    resumed = read_map(out / "map")
+    assert resumed.sign_id == whole.sign_id
+    # Lanes are matched anew from where they began: both stop within a thousandth of the cost.
+    assert (resumed.signs.corners_world - whole.signs.corners_world).abs().max() < 5e-3
+
+
+def test_overwrite_replaces_a_run(optimize, quick, run: Path, copy: Path, tmp_path: Path):
+    out = Path(shutil.copytree(run, tmp_path / "run"))
+    shutil.rmtree(journeys_of(copy)[-1])
+    shutil.rmtree(copy / "survey")
+    said = optimize(copy, out, "--overwrite")
+    assert said.code == 0
+    listed = json.loads((out / "map" / "map.json").read_text())["provenance"]["journeys"]
+    assert listed == ["journey-000", "journey-001"]
+    assert [p.name for p in journeys_of(out)] == listed
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["survey"] is None and metrics["counts"]["journeys"] == 2
+    assert len(list((out / "tensorboard").iterdir())) == 1
+
+
+def test_an_older_map_stays_while_the_new_one_is_not_complete(
+    optimize, quick, run: Path, tiny_folder: Path, tmp_path: Path, monkeypatch
+):
+    out = Path(shutil.copytree(run, tmp_path / "run"))
+    before = {p: p.read_bytes() for p in (out / "map").iterdir()}
+    interrupt_at(monkeypatch, 1)
+    with pytest.raises(Interruption):
+        optimize(tiny_folder, out, "--overwrite")
+    assert {p: p.read_bytes() for p in (out / "map").iterdir()} == before
+
+
+# Wrong input.
+
+
+def assert_refused(said: Said, out: Path, *words: str) -> None:
+    """Exit code 2, one line that says what is wrong, no map."""
+    assert said.code == 2
+    assert said.err.count("\n") == 1 and said.err.startswith("crowdmap optimize: ")
+    assert [word for word in words if word not in said.err] == []
+    assert not out.exists()
+
+
+def test_a_missing_dataset_is_one_line(optimize, tmp_path: Path):
+    out = tmp_path / "run"
+    assert_refused(optimize(tmp_path / "none", out), out, "none", "folder is missing")
+
+
+def test_a_dataset_without_its_head_is_one_line(optimize, copy: Path, tmp_path: Path):
+    (copy / "dataset.json").unlink()
+    assert_refused(optimize(copy, tmp_path / "run"), tmp_path / "run", "dataset.json")
+
+
+@pytest.mark.parametrize("what", ["nonsense: 1", "seed: [1", "adjust: {lm: {steps: 1}}"])
+def test_a_wrong_configuration_is_one_line(optimize, tiny_folder: Path, tmp_path: Path, what: str):
+    config = tmp_path / "some.yaml"
+    config.write_text(what)
+    said = optimize(tiny_folder, tmp_path / "run", "--config", str(config))
+    assert_refused(said, tmp_path / "run", "some.yaml")
+
+
+def test_a_missing_configuration_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):
+    said = optimize(tiny_folder, tmp_path / "run", "--config", str(tmp_path / "none.yaml"))
+    assert_refused(said, tmp_path / "run", "none.yaml", "cannot be read")
+
+
+def test_an_unknown_device_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):
+    said = optimize(tiny_folder, tmp_path / "run", "--device", "abacus")
+    assert_refused(said, tmp_path / "run", "--device abacus", "cpu or cuda")
+
+
+def test_a_survey_that_cannot_be_read_is_one_line(optimize, copy: Path, tmp_path: Path):
+    (copy / "survey" / "signs.parquet").write_bytes(b"nonsense")
+    said = optimize(copy, tmp_path / "run")
+    assert_refused(said, tmp_path / "run", "survey", "signs.parquet", "cannot be read")
+
+
+def test_a_truth_that_cannot_be_read_is_one_line(optimize, copy: Path, tmp_path: Path):
+    (copy / "survey" / "truth" / "journey-001" / "poses.parquet").write_bytes(b"nonsense")
+    said = optimize(copy, tmp_path / "run")
+    assert_refused(said, tmp_path / "run", "truth", "poses.parquet", "cannot be read")
+
+
+def test_a_survey_of_another_place_is_one_line(optimize, copy: Path, tmp_path: Path):
+    head = json.loads((copy / "survey" / "map.json").read_text())
+    head["origin"]["lon_deg"] += 0.001
+    (copy / "survey" / "map.json").write_text(json.dumps(head))
+    assert_refused(optimize(copy, tmp_path / "run"), tmp_path / "run", "expected one origin")
+
+
+def test_a_bad_journey_with_strict_is_one_line(optimize, copy: Path, tmp_path: Path):
+    spoil_pose(journeys_of(copy)[1])
+    said = optimize(copy, tmp_path / "run", "--strict")
+    assert_refused(said, tmp_path / "run", "journey-001", "poses.parquet", "'x'")
+
+
+def test_journeys_that_are_all_bad_are_one_line(optimize, copy: Path, tmp_path: Path):
+    for journey in journeys_of(copy):
+        spoil_pose(journey)
+    said = optimize(copy, tmp_path / "run")
+    assert_refused(said, tmp_path / "run", "all 3 journeys are set aside", "journey-000")
+
+
+# Datasets with little in them.
+
+
+def test_bad_journeys_are_set_aside_and_the_one_that_is_left_is_the_map(
+    optimize, copy: Path, tmp_path: Path
+):
+    first, second, third = journeys_of(copy)
+    spoil_pose(second)
+    (third / "lanes.parquet").unlink()
+    out = tmp_path / "run"
+    said = optimize(copy, out)
+    assert said.code == 0
+    aside = [line for line in said.err.splitlines() if line.startswith("set aside ")]
+    assert len(aside) == 2 and second.name in aside[0] and third.name in aside[1]
+    rejected = json.loads((out / "metrics.json").read_text())["rejected_journeys"]
+    assert [r["journey_id"] for r in rejected] == [second.name, third.name]
+    assert "'x'" in rejected[0]["reason"] and "lanes.parquet" in rejected[1]["reason"]
+    assert [p.name for p in journeys_of(out)] == [first.name]
+    # Of a single journey, its own signs are the map.
+    hd_map = read_map(out / "map")
+    assert len(hd_map.signs) >= 3 and len(hd_map.lanes) >= 1
+    assert (hd_map.signs.n_journeys == 1).all()
+    assert (out / "report.html").exists()
+
+
+def test_journeys_without_detections_give_a_map_without_rows(optimize, copy: Path, tmp_path: Path):
+    for journey in journeys_of(copy):
+        for name in ("signs", "lanes"):
+            path = journey / f"{name}.parquet"
+            pq.write_table(pq.read_table(path).slice(0, 0), path)
+    out = tmp_path / "run"
+    assert optimize(copy, out).code == 0
+    for name in ("map", "map_clusters"):
+        assert columns(out / name / "signs.parquet") >= SIGN
+        assert columns(out / name / "lanes.parquet") >= LANE
+        hd_map = read_map(out / name)
+        assert len(hd_map.signs) == len(hd_map.lanes) == 0
+    assert pq.read_table(out / "associations.parquet").num_rows == 0
+    assert json.loads((out / "metrics.json").read_text())["counts"]["signs of the map"] == 0
+    assert (out / "report.html").exists()
+    given, refined = (
+        pq.read_table(d / "journeys" / "journey-000" / "poses.parquet") for d in (copy, out)
+    )
+    assert np.allclose(given["x"].to_numpy(), refined["x"].to_numpy())
+
+
+def test_control_points_pin_the_map_and_are_left_out_of_its_figures(
+    optimize, quick, copy: Path, tmp_path: Path
+):
+    said = optimize(copy, tmp_path / "run", "--control", str(copy / "survey"))
+    assert said.code == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["counts"]["control points"] > 0
+    assert metrics["survey"]["control_signs"] >= metrics["counts"]["control points"]
+    assert metrics["survey"]["signs"]["matched_observable"] == 0
+
+
+def test_control_points_of_another_place_are_one_line(optimize, copy: Path, tmp_path: Path):
+    control = Path(shutil.copytree(copy / "survey", tmp_path / "control"))
+    head = json.loads((control / "map.json").read_text())
+    head["origin"]["lat_deg"] += 0.001
+    (control / "map.json").write_text(json.dumps(head))
+    said = optimize(copy, tmp_path / "run", "--control", str(control))
+    assert_refused(said, tmp_path / "run", "expected one origin")
+
+
+def test_what_looks_wrong_is_said_before_mapping_and_kept(
+    copy: Path, tmp_path: Path, optimize: Callable[..., Said], quick: None
+):
+    for journey in journeys_of(copy):
+        swap_axes(journey)
+    said = optimize(copy, tmp_path / "run")
+    lines = [line for line in said.err.splitlines() if line.startswith("looks wrong: ")]
+    assert len(lines) == 1 and "quaternions are stored as w x y z; store qx qy qz qw" in lines[0]
+    (warning,) = json.loads((tmp_path / "run" / "metrics.json").read_text())["warnings"]
+    assert warning["kind"] == "quaternion-order"
+    assert warning["journeys"] == [path.name for path in journeys_of(copy)]
+
+
+def test_nothing_looks_wrong_with_a_good_data_set(run: Path):
+    assert json.loads((run / "metrics.json").read_text())["warnings"] == []
+
+
+@pytest.mark.parametrize("place", [".", "..", "run", "journeys", "link"])
+def test_a_run_never_overlaps_the_data_set(copy: Path, optimize: Callable[..., Said], place: str):
+    before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
+    link = copy.parent / "link"
+    link.symlink_to(copy)
+    said = optimize(copy, link if place == "link" else copy / place, "--overwrite")
+    assert said.code == 2 and "overlaps the dataset" in said.err
+    assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before

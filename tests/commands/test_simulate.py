@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from crowdmap_torch.cli import main
+
+
+def simulate(*arguments: object) -> int:
+    return main(["simulate", *map(str, arguments)])
+
+
+def test_every_number_of_a_preset_is_an_option(tmp_path: Path, capsys):
+    out = tmp_path / "data"
+    options = "--world street --length-m 100 --journeys 2 --bias-e-m 7 --no-sigmas --missed 0.5"
+    assert simulate(out, *options.split(), "--bad-drives", "jump") == 0
+    assert "2 journeys" in capsys.readouterr().out
+    settings = json.loads((out / "survey" / "map.json").read_text())["provenance"]["settings"]
+    assert settings["positioning"]["bias_e_m"] == 7 and not settings["positioning"]["sigmas"]
+    assert settings["world"]["length_m"] == 100 and settings["signs"]["missed"] == 0.5
+    bad = json.loads((out / "survey" / "truth" / "bad_drives.json").read_text())
+    assert list(bad.values()) == ["jump"]
+    poses = pq.read_table(out / "journeys" / "journey-000" / "poses.parquet")
+    assert "sigma_e" not in poses.column_names
+
+
+@pytest.mark.parametrize(
+    "options", [["--journeys", "0"], ["--bad-drives", "flat-tyre"], ["--camera", "lomo"]]
+)
+def test_wrong_options_are_one_line_and_exit_code_2(tmp_path: Path, capsys, options):
+    assert simulate(tmp_path / "data", "--world", "street", *options) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("crowdmap simulate: ") and error.count("\n") == 1
+    assert not (tmp_path / "data").exists()
+
+
+def test_existing_output_is_refused(tmp_path: Path, capsys):
+    (tmp_path / "data").mkdir()
+    assert simulate(tmp_path / "data", "--world", "street") == 2
+    assert "--overwrite" in capsys.readouterr().err

@@ -1,0 +1,45 @@
+"""The way along a trajectory."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry.trajectory import station
+
+F64 = torch.float64
+
+
+def at(position: Tensor) -> Tensor:
+    """Poses at places [f, 3], turned anyhow."""
+    return se3.make(se3.so3_exp(0.1 * position), position)
+
+
+def test_way_at_constant_speed_is_the_distance():
+    place = torch.arange(50, dtype=F64)[:, None] * torch.tensor([0.6, 0.8, 0.0], dtype=F64)
+    torch.testing.assert_close(station(at(place)), torch.arange(50, dtype=F64))
+
+
+def test_noise_makes_no_way_where_it_would_sum_up(generator):
+    noise = 0.02 * torch.randn(400, 3, dtype=F64, generator=generator)
+    summed = noise.diff(dim=0).norm(dim=-1).sum()
+    # Positions 14 frames apart: a fourteenth of the way that neighbours make.
+    assert float(station(at(noise))[-1]) < float(summed) / 10
+
+
+def test_way_never_falls_and_does_not_depend_on_the_world(generator):
+    place = torch.randn(80, 3, dtype=F64, generator=generator).cumsum(0)
+    T_there_world = se3.exp(torch.tensor([50.0, -30.0, 4.0, 0.2, -0.3, 2.0], dtype=F64))
+    way = station(at(place))
+    assert bool((way.diff() >= 0).all()) and float(way[0]) == 0.0
+    torch.testing.assert_close(station(T_there_world @ at(place)), way)
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+def test_few_frames(frames):
+    place = torch.arange(frames, dtype=F64)[:, None].expand(frames, 3)
+    way = station(at(place))
+    assert way.shape == (frames,)
+    assert way.tolist() == pytest.approx([3**0.5 * k for k in range(frames)])

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import torch
+
+from crowdmap_torch.geometry import spline_fit
+from crowdmap_torch.lanes.pieces import cut_by_length, cut_by_number, fit_pieces, runs_of
+
+F64 = torch.float64
+PLAIN = {"smoothing": 0.0, "scales": (4.0, 1.0)}
+
+
+def test_runs_end_at_gaps_and_at_markers() -> None:
+    along = torch.tensor([0.0, 30, 5, 12, 0, 55, 41], dtype=F64)
+    marker = torch.tensor([0, 0, 0, 0, 1, 0, 0])
+    run = runs_of(marker, along, 15.0)
+    assert run.tolist() == [0, 1, 0, 0, 3, 2, 1] or len(set(run.tolist())) == 3
+    assert run[0] == run[2] == run[3]
+    assert run[1] == run[6] == run[5]
+    assert len({int(run[0]), int(run[1]), int(run[4])}) == 3
+
+
+def test_pieces_have_one_length_cover_all_and_overlap(generator: torch.Generator) -> None:
+    along = 130 * torch.rand(2000, dtype=F64, generator=generator)
+    marker = torch.zeros(2000, dtype=torch.int64)
+    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    assert len(set(pieces.point.tolist())) == 2000
+    for k in range(len(pieces)):
+        own = along[pieces.point[pieces.piece == k]]
+        assert 39 < own.max() - own.min() <= 40 + 1e-6
+    starts = torch.stack([along[pieces.point[pieces.piece == k]].min() for k in range(len(pieces))])
+    assert bool((starts.diff() > 10).all() and (starts.diff() < 20.5).all())
+    assert bool((pieces.control_count == 6).all())
+    assert bool(((pieces.t >= 0) & (pieces.t <= 5)).all())
+
+
+def test_short_runs_get_fewer_control_points() -> None:
+    along = torch.linspace(0, 17, 50, dtype=F64)
+    marker = torch.zeros(50, dtype=torch.int64)
+    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    assert pieces.control_count.tolist() == [3]
+    assert len(pieces.piece) == 50
+
+
+def test_recent_points_come_in_overlapping_pieces_of_one_size() -> None:
+    marker = torch.tensor([0] * 230 + [1] * 40)
+    frame = torch.arange(270) // 5
+    point = torch.stack((torch.arange(270), torch.zeros(270), torch.zeros(270)), -1).to(F64)
+    pieces = cut_by_number(marker, frame, point, number=100, control_points=6)
+    size = torch.bincount(pieces.piece)
+    assert size[pieces.marker == 0].tolist() == [100] * 4
+    assert size[pieces.marker == 1].tolist() == [40]
+    assert set(pieces.point[pieces.marker[pieces.piece] == 0].tolist()) == set(range(230))
+    assert bool((marker[pieces.point] == pieces.marker[pieces.piece]).all())
+
+
+def test_fit_agrees_with_the_spline_of_geometry(generator: torch.Generator) -> None:
+    along = 75 * torch.rand(400, dtype=F64, generator=generator)
+    noise = 0.01 * torch.randn(400, dtype=F64, generator=generator)
+    point = torch.stack((along, 3 * torch.sin(along / 15) + noise, along / 20), dim=-1)
+    marker = torch.zeros(400, dtype=torch.int64)
+    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    fit = fit_pieces(pieces, point, torch.full((400,), 1.0, dtype=F64), smoothing=0.0, scales=())
+    expected = spline_fit.fit_flat(
+        point[pieces.point], pieces.piece, pieces.t, pieces.control_count
+    )
+    torch.testing.assert_close(fit.control, expected, atol=1e-6, rtol=0)
+
+
+def test_dear_bending_makes_pieces_straight(generator: torch.Generator) -> None:
+    along = 40 * torch.rand(100, dtype=F64, generator=generator)
+    point = torch.stack((along, 3 * torch.sin(along / 5), along / 20), dim=-1)
+    marker, sigma = torch.zeros(100, dtype=torch.int64), torch.ones(100, dtype=F64)
+    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    fit = fit_pieces(pieces, point, sigma, smoothing=1e6, scales=())
+    assert len(pieces) == 1
+    assert fit.control.diff(n=2, dim=0).abs().max() < 1e-5
+
+
+def test_outliers_do_not_move_a_fit(generator: torch.Generator) -> None:
+    along = torch.linspace(0, 40, 200, dtype=F64)
+    lateral = 0.05 * torch.randn(200, dtype=F64, generator=generator)
+    lateral[::8] += 3.5
+    point = torch.stack((along, lateral, torch.zeros_like(along)), dim=-1)
+    marker = torch.zeros(200, dtype=torch.int64)
+    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    fit = fit_pieces(
+        pieces,
+        point,
+        torch.full((200,), 0.05, dtype=F64),
+        smoothing=1e-4,
+        scales=(8.0, 4.0, 2.0, 1.0),
+    )
+    assert fit.control[:, 1].abs().max() < 0.06
+    assert bool((fit.weight[pieces.point % 8 == 0] < 0.01).all())
+
+
+def test_sigma_is_the_scatter_of_fits(generator: torch.Generator) -> None:
+    trials = 300
+    along = torch.linspace(0, 40, 120, dtype=F64).repeat(trials)
+    marker = torch.arange(trials).repeat_interleave(120)
+    lateral = 0.1 * torch.randn(len(along), dtype=F64, generator=generator)
+    point = torch.stack((along, lateral, torch.zeros_like(along)), dim=-1)
+    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    # The noise is not what was expected, and is found out.
+    fit = fit_pieces(pieces, point, torch.full_like(along, 0.05), **PLAIN)
+    scatter = fit.control[:, 1].reshape(trials, 6).square().mean(0).sqrt()
+    sigma = fit.sigma.reshape(trials, 6).mean(0)
+    torch.testing.assert_close(sigma, scatter, rtol=0.3, atol=0)
+
+
+def test_no_points_give_no_pieces() -> None:
+    none, real = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=F64)
+    for pieces in (
+        cut_by_length(none, real, max_gap=15, length=40, overlap=0.5, control_points=6),
+        cut_by_number(none, none, real.reshape(0, 3), number=100, control_points=6),
+    ):
+        fit = fit_pieces(pieces, real.reshape(0, 3), real, **PLAIN)
+        assert len(pieces) == 0 and len(fit.control) == 0

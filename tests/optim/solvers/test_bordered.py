@@ -1,0 +1,76 @@
+"""Chains with unknowns of their own against the dense solve."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from worlds.bordered_chains import drives, rows_of
+
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.solvers.bordered import BorderedBackend
+from crowdmap_torch.optim.solvers.dense import DenseBackend
+
+
+@pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
+def test_a_border_gives_the_dense_step(lengths):
+    problem, values, plan = drives(lengths)
+    ours, dense = (b.assemble(problem, values) for b in (BorderedBackend(plan), DenseBackend()))
+    torch.testing.assert_close(ours.cost, dense.cost)
+    for name, cost in dense.term_cost.items():
+        torch.testing.assert_close(ours.term_cost[name], cost)
+    for damping in (1e-9, 1e-2, 1e2):
+        damping = torch.tensor([damping], dtype=torch.float64)
+        mine, theirs = ours.solve(damping), dense.solve(damping)
+        for name in values:
+            torch.testing.assert_close(mine.delta[name], theirs.delta[name], rtol=1e-8, atol=1e-10)
+        torch.testing.assert_close(mine.predicted, theirs.predicted)
+        torch.testing.assert_close(mine.norm, theirs.norm)
+
+
+def test_covariances_are_blocks_of_the_dense_inverse():
+    problem, values, plan = drives()
+    dense = DenseBackend().assemble(problem, values)
+    inverse, chain = torch.linalg.inv(dense.hessian[0]), plan.chain
+    # Sums over each chain: of the first entry by mean, of the second by differing weights.
+    weight = torch.zeros(len(chain), 2, 2, dtype=torch.float64)
+    weight[:, 0, 0] = 1 / torch.bincount(chain)[chain].double()
+    weight[:, 1, 1] = torch.linspace(-1, 2, len(chain)).double()
+    found = BorderedBackend(plan).assemble(problem, values).covariance(floor=0.0)
+    mark, drift = rows_of(dense, "mark"), rows_of(dense, "drift")
+    torch.testing.assert_close(found.matrix, inverse[mark][:, mark], rtol=1e-8, atol=1e-12)
+    per_chain = torch.zeros(len(drift), 4, 2, dtype=torch.float64)
+    rows = torch.arange(len(drift))
+    per_chain[rows, chain[rows // 2]] = weight.flatten(0, 1)
+    sums = per_chain.flatten(1)
+    joint = (sums.mT @ inverse[drift][:, drift] @ sums).view(4, 2, 4, 2)
+    every = torch.arange(4)
+    expected = joint[every, :, every]
+    torch.testing.assert_close(found.of_chain_sums(weight), expected, rtol=1e-8, atol=1e-12)
+
+
+def test_a_covariance_whose_factors_are_gone_is_refused():
+    problem, values, plan = drives()
+    normal = BorderedBackend(plan).assemble(problem, values)
+    covariance = normal.covariance()
+    normal.solve(torch.tensor([1e-3], dtype=torch.float64))
+    with pytest.raises(ValueError, match="solved since"):
+        covariance.of_chain_sums(torch.zeros(len(plan.chain), 2, 1, dtype=torch.float64))
+
+
+def test_the_minimum_is_that_of_the_dense_back_end():
+    problem, values, plan = drives(seed=1)
+    config = lm.LmConfig(cost_tolerance=1e-13)
+    ours = lm.solve(problem, values, config, backend=BorderedBackend(plan))
+    theirs = lm.solve(problem, values, config)
+    assert ours.done
+    for name, value in theirs.values.items():
+        torch.testing.assert_close(ours.values[name], value, rtol=0, atol=1e-6)
+
+
+def test_a_chain_that_is_not_positive_definite_moves_nothing():
+    problem, values, plan = drives()
+    normal = BorderedBackend(plan).assemble(problem, values)
+    normal.inner.diagonal[40] = -normal.inner.diagonal[40]
+    step = normal.solve(torch.tensor([1e-9], dtype=torch.float64))
+    assert not bool(step.solved)
+    assert not any(delta.any() for delta in step.delta.values())

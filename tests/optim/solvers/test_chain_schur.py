@@ -1,0 +1,257 @@
+"""Elimination along chains against the dense solve, on problems small enough for both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.linearize import rows
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
+from crowdmap_torch.optim.robust import Tukey
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
+from crowdmap_torch.optim.solvers.dense import DenseBackend
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
+
+
+def difference(x, y):
+    return y - x
+
+
+def prior(x, mean):
+    return x - mean
+
+
+def sighting(pose, landmark, measured):
+    """A bearing-like, nonlinear sighting of a landmark from a pose."""
+    offset = landmark - pose[:2]
+    return torch.stack((torch.atan2(offset[1], offset[0]), offset.norm())) + pose[2] - measured
+
+
+def pair_sighting(pose, first, second, measured):
+    return (0.3 * first + 0.7 * second - pose[:2]) - measured
+
+
+def problem(chain_lengths, landmarks=9, seed=0):
+    """Chains of 2D poses with a common offset that see landmarks near them, as a Problem and start values."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(*shape, scale=1.0):
+        return scale * torch.randn(*shape, dtype=torch.float64, generator=generator)
+
+    chain = torch.repeat_interleave(torch.arange(len(chain_lengths)), torch.tensor(chain_lengths))
+    n = len(chain)
+    step = torch.cat([torch.arange(length) for length in chain_lengths]).double()
+    poses = torch.stack((step, 0.1 * noise(n), 0.1 * noise(n)), dim=-1)
+    marks = torch.stack(
+        (torch.linspace(0, max(chain_lengths), landmarks).double(), 3 + noise(landmarks)), dim=-1
+    )
+    distance = (poses[:, None, 0] - marks[None, :, 0]).abs()
+    pose, mark = torch.nonzero(distance < 6, as_tuple=True)
+    measured = torch.stack(
+        [
+            sighting(poses[p], marks[m], torch.zeros(2).double())
+            for p, m in zip(pose, mark, strict=True)
+        ]
+    ) + noise(len(pose), 2, scale=0.01)
+    measured[::17] += 2.0
+    follows = torch.nonzero(chain[1:] == chain[:-1])[:, 0]
+    second = (mark + 1) % landmarks
+    pair = 0.3 * marks[mark] + 0.7 * marks[second] - poses[pose][:, :2]
+    terms = {
+        "prior": CostTerm(
+            prior,
+            (("pose", torch.arange(n)),),
+            (poses + noise(n, 3, scale=0.1),),
+            torch.full((n,), 2.0).double(),
+        ),
+        "odometry": CostTerm(
+            difference,
+            (("pose", follows + 1), ("pose", follows)),
+            (),
+            torch.full((len(follows),), 3.0).double(),
+        ),
+        "sighting": CostTerm(
+            sighting,
+            (("pose", pose), ("mark", mark)),
+            (measured,),
+            torch.full((len(pose),), 30.0).double(),
+            Tukey(20.0),
+        ),
+        "pair": CostTerm(
+            pair_sighting, (("pose", pose), ("mark", mark), ("mark", second)), (pair,), None
+        ),
+        "mark_prior": CostTerm(prior, (("mark", torch.arange(landmarks)),), (marks,), None),
+    }
+    variables = {"pose": Variable(3, euclidean), "mark": Variable(2, euclidean)}
+    values = {
+        "pose": poses + noise(n, 3, scale=0.1),
+        "mark": marks + noise(landmarks, 2, scale=0.2),
+    }
+    return Problem(variables, terms), values, chain
+
+
+@pytest.mark.parametrize("lengths", [[1], [9], [10, 1, 9, 8], [85, 40], [19, 2, 33]])
+@pytest.mark.parametrize(("group_size", "batch_bytes"), [(None, 1 << 22), (1, 1), (3, 2000)])
+def test_elimination_gives_the_dense_step(lengths, group_size, batch_bytes):
+    built, values, chain = problem(lengths)
+    backend = ChainBackend(EliminationPlan("pose", chain), group_size, batch_bytes)
+    chained, dense = (b.assemble(built, values) for b in (backend, DenseBackend()))
+    torch.testing.assert_close(chained.cost, dense.cost)
+    for damping in (1e-6, 1e-1, 1e3):
+        damping = torch.tensor([damping], dtype=torch.float64)
+        ours, theirs = chained.solve(damping), dense.solve(damping)
+        for name in values:
+            torch.testing.assert_close(ours.delta[name], theirs.delta[name], rtol=1e-8, atol=1e-10)
+        torch.testing.assert_close(ours.predicted, theirs.predicted)
+        torch.testing.assert_close(ours.norm, theirs.norm)
+
+
+@pytest.mark.parametrize("lengths", [[1], [10, 1, 9], [85, 40]])
+def test_leaves_and_chain_give_the_dense_step(lengths):
+    built, values, chain = problem(lengths)
+    n = len(chain)
+    every = torch.arange(n)
+    bound = CostTerm(
+        difference, (("pose", every), ("drift", every)), (), torch.full((n,), 9.0).double()
+    )
+    terms = {
+        name: replace(
+            term, slots=tuple(("drift" if name == "odometry" else s, i) for s, i in term.slots)
+        )
+        for name, term in built.terms.items()
+    }
+    variables = {**built.variables, "drift": Variable(3, euclidean)}
+    problem_with_leaves = Problem(variables, {**terms, "bound": bound})
+    values = {**values, "drift": values["pose"] + 0.1}
+    backend = ChainBackend(EliminationPlan("drift", chain, "pose", every), group_size=7)
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    ours = backend.assemble(problem_with_leaves, values).solve(damping)
+    dense = DenseBackend().assemble(problem_with_leaves, values)
+    theirs = dense.solve(damping)
+    for name in values:
+        torch.testing.assert_close(ours.delta[name], theirs.delta[name], rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(ours.predicted, theirs.predicted)
+
+
+def test_a_block_of_the_chain_may_carry_several_leaves():
+    built, values, chain = problem([30, 21], seed=4)
+    n = len(chain)
+    # One drift for every three poses of a chain.
+    first = torch.cat((torch.tensor([True]), chain[1:] != chain[:-1]))
+    rank = torch.arange(n) - torch.arange(n)[first][first.cumsum(0) - 1]
+    begins = first | (rank % 3 == 0)
+    carrier = begins.cumsum(0) - 1
+    drift_chain = chain[begins]
+    link = torch.nonzero(drift_chain[1:] == drift_chain[:-1])[:, 0]
+    bound = CostTerm(
+        difference,
+        (("pose", torch.arange(n)), ("drift", carrier)),
+        (),
+        torch.full((n,), 9.0).double(),
+    )
+    terms = {
+        **{name: term for name, term in built.terms.items() if name != "odometry"},
+        "drift": CostTerm(difference, (("drift", link), ("drift", link + 1))),
+        "bound": bound,
+    }
+    carried = Problem({**built.variables, "drift": Variable(3, euclidean)}, terms)
+    values = {**values, "drift": values["pose"][begins] + 0.1}
+    backend = ChainBackend(EliminationPlan("drift", drift_chain, "pose", carrier), group_size=3)
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    ours = backend.assemble(carried, values).solve(damping)
+    theirs = DenseBackend().assemble(carried, values).solve(damping)
+    for name in values:
+        torch.testing.assert_close(ours.delta[name], theirs.delta[name], rtol=1e-8, atol=1e-10)
+
+
+def test_marginal_covariance_is_the_block_of_the_dense_inverse():
+    built, values, chain = problem([40, 25], seed=3)
+    marginal = (
+        ChainBackend(EliminationPlan("pose", chain))
+        .assemble(built, values)
+        .covariance(floor=0.0)
+        .matrix
+    )
+    dense = DenseBackend().assemble(built, values)
+    n = 3 * len(chain)
+    torch.testing.assert_close(
+        marginal, torch.linalg.inv(dense.hessian[0])[n:, n:], rtol=1e-7, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("lengths", [[1], [2], [10, 1, 9, 8], [85, 40], [19, 2, 33]])
+def test_block_covariances_are_those_of_the_dense_inverse_with_landmarks_held(lengths):
+    built, values, chain = problem(lengths, seed=4)
+    backend = ChainBackend(EliminationPlan("pose", chain), group_size=5)
+    found = backend.assemble(built, values).conditional_covariance("pose")
+    n = len(chain)
+    of_chains = DenseBackend().assemble(built, values).hessian[0, : 3 * n, : 3 * n]
+    inverse = torch.linalg.inv(of_chains).view(n, 3, n, 3)
+    every = torch.arange(n)
+    torch.testing.assert_close(found, inverse[every, :, every], rtol=1e-8, atol=1e-12)
+
+
+def test_both_back_ends_reach_the_same_minimum():
+    built, values, chain = problem([30, 20], seed=1)
+    config = lm.LmConfig(cost_tolerance=1e-12)
+    ours = lm.solve(built, values, config, backend=ChainBackend(EliminationPlan("pose", chain)))
+    theirs = lm.solve(built, values, config)
+    assert ours.done
+    torch.testing.assert_close(ours.cost, theirs.cost, rtol=1e-9, atol=0)
+    torch.testing.assert_close(ours.values["mark"], theirs.values["mark"], rtol=0, atol=1e-6)
+
+
+def test_the_step_does_not_depend_on_the_order_of_rows():
+    built, values, chain = problem([30, 20], seed=2)
+    generator = torch.Generator().manual_seed(0)
+    shuffled = {}
+    for name, term in built.terms.items():
+        shuffled[name] = rows(term, torch.randperm(len(term), generator=generator))
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    first = ChainBackend(EliminationPlan("pose", chain)).assemble(built, values).solve(damping)
+    second = (
+        ChainBackend(EliminationPlan("pose", chain))
+        .assemble(Problem(built.variables, shuffled), values)
+        .solve(damping)
+    )
+    for name in values:
+        torch.testing.assert_close(first.delta[name], second.delta[name], rtol=1e-9, atol=1e-11)
+
+
+def test_links_between_distant_blocks_are_refused():
+    built, values, chain = problem([12])
+    far = CostTerm(difference, (("pose", torch.tensor([0])), ("pose", torch.tensor([5]))))
+    with pytest.raises(ValueError, match="neither neighbours"):
+        ChainBackend(EliminationPlan("pose", chain)).assemble(
+            Problem(built.variables, {**built.terms, "far": far}), values
+        )
+
+
+def test_a_chain_that_is_not_positive_definite_gives_a_failed_step_and_no_covariance():
+    built, values, chain = problem([12, 7])
+    normal = ChainBackend(EliminationPlan("pose", chain)).assemble(built, values)
+    spoilt = normal.diagonal.clone()
+    spoilt[5] = -spoilt[5]
+    spoilt_normal = replace(normal, diagonal=spoilt)
+    step = spoilt_normal.solve(torch.tensor([1e-6], dtype=torch.float64))
+    assert not bool(step.solved)
+    with pytest.raises(ValueError, match="not positive definite"):
+        spoilt_normal.covariance()
+
+
+def test_kept_factors_give_the_step_of_another_gradient():
+    built, values, chain = problem([30, 20], seed=5)
+    damping = torch.tensor([0.0], dtype=torch.float64)
+    normal = ChainBackend(EliminationPlan("pose", chain)).assemble(built, values)
+    normal.solve(damping)
+    gradient = {name: torch.randn_like(value) for name, value in values.items()}
+    step = normal.solve_again(gradient)
+    dense = DenseBackend().assemble(built, values)
+    stacked = torch.cat((gradient["pose"].flatten(), gradient["mark"].flatten()))
+    expected = -torch.linalg.solve(dense.hessian[0], stacked)
+    n = 3 * len(chain)
+    torch.testing.assert_close(step["pose"].flatten(), expected[:n], rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(step["mark"].flatten(), expected[n:], rtol=1e-7, atol=1e-9)

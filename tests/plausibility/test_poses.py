@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from worlds.drives import make_journey
+
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.plausibility.poses import pose_findings
+from crowdmap_torch.tables import Journey, Origin, Rig
+
+ORIGIN = Origin(48.0, 11.5, 520.0)
+CAMERA = Camera(
+    "brown_conrady", 640, 480, torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]).double(),
+    torch.zeros(0).double(),
+)  # fmt: skip
+RIG = Rig("rig", CAMERA, torch.eye(4).double(), torch.tensor([0.0, 1, 0]).double(), 1.4)
+
+
+def drive(heading: torch.Tensor, *, step_m: float = 1.0) -> Journey:
+    """A drive along headings [rad from east], a frame each 0.1 s, the camera ahead and upright."""
+    ahead = torch.stack((heading.cos(), heading.sin(), torch.zeros_like(heading)), dim=-1)
+    down = torch.tensor([0.0, 0.0, -1.0]).double().expand_as(ahead)
+    R = torch.stack((torch.linalg.cross(down, ahead), down, ahead), dim=-1)
+    return make_journey(RIG, se3.make(R, (step_m * ahead).cumsum(0)))
+
+
+def kinds(journey: Journey) -> list[str]:
+    return [finding.kind for finding in pose_findings(journey, ORIGIN)]
+
+
+@pytest.mark.parametrize("heading_deg", range(-180, 180, 30))
+def test_a_camera_that_looks_ahead_is_sound_whatever_the_heading(heading_deg: int) -> None:
+    heading = torch.linspace(0, 0.5, 60).double() + math.radians(heading_deg)
+    assert kinds(drive(heading)) == []
+
+
+def test_a_car_that_stands_tells_nothing() -> None:
+    assert kinds(drive(torch.zeros(60).double(), step_m=0.0)) == []
+
+
+def test_a_camera_that_looks_aside_is_named_without_a_cause() -> None:
+    journey = drive(torch.zeros(60).double())
+    aside = se3.exp(torch.tensor([0, 0, 0, 0, 1.2, 0]).double())
+    turned = replace(journey, T_world_camera=journey.T_world_camera @ aside)
+    assert kinds(turned) == ["axes"]
+
+
+def test_a_leap_is_named_with_its_frames() -> None:
+    journey = drive(torch.zeros(60).double())
+    T = journey.T_world_camera.clone()
+    T[30:, 0, 3] += 400
+    (found,) = pose_findings(replace(journey, T_world_camera=T), ORIGIN)
+    assert found.kind == "leap"
+    assert "frames 29 and 30" in found.evidence
+
+
+def test_times_in_another_unit_are_named() -> None:
+    journey = drive(torch.zeros(60).double())
+    assert kinds(replace(journey, t_ns=journey.t_ns // 1000)) == ["frame-times"]
+
+
+def test_a_drive_at_the_height_of_its_origin_alone_is_not_enough() -> None:
+    low = Origin(ORIGIN.lat_deg, ORIGIN.lon_deg, 0.4)
+    assert pose_findings(drive(torch.zeros(60).double()), low) == []

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from crowdmap_torch import mapper
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.report.tensorboard import TensorBoardLog
+from crowdmap_torch.report.watch import Watch, pixel_residuals
+from crowdmap_torch.tables import Dataset, Survey
+
+
+@pytest.fixture(scope="module")
+def watched(tiny: Dataset, tiny_result: MapResult, tiny_survey: Survey, tmp_path_factory):
+    """Three steps of an adjustment, every second one looked at; and where they were logged."""
+    folder: Path = tmp_path_factory.mktemp("log")
+    first = tiny_result.first
+    bundle = mapper.build_bundle(tiny.journeys, tiny_result.journey_maps, first, MapperConfig())
+    state = adjust.start(bundle)
+    with TensorBoardLog(folder) as log:
+        watch = Watch(log, tiny_survey, first.signs, first.lanes, every=2)
+        watch.start(bundle, mapper.clusters_map(tiny, first))
+        for number, after in adjust.steps(bundle, state):
+            watch.step(number, after, bundle)
+            if number == 2:
+                break
+        watch.finish(bundle, tiny_result.hd_map)
+    size = {"scalars": 0, "histograms": 1, "images": 1}
+    return watch, bundle, EventAccumulator(str(folder), size_guidance=size).Reload()
+
+
+def test_every_step_is_kept_and_logged_with_its_cost(watched):
+    watch, _, events = watched
+    assert [i.number for i in watch.iterations] == [1, 2, 3]
+    logged = events.Scalars("cost/total")
+    assert [event.step for event in logged] == [1, 2, 3]
+    # Events are of single precision.
+    assert [e.value for e in logged] == pytest.approx([i.total for i in watch.iterations], rel=1e-6)
+
+
+def test_errors_and_residuals_are_those_of_the_steps_looked_at(watched):
+    watch, _, events = watched
+    assert [bool(i.errors) for i in watch.iterations] == [True, False, True]
+    assert "residual/sign_reprojection" in events.Tags()["histograms"]
+    # Before the first step, and after the first and the third.
+    assert [e.step for e in events.Scalars("error/corner_m")] == [0, 1, 3]
+
+
+def test_pixel_residuals_are_lengths_and_smaller_after_the_adjustment(watched):
+    watch, bundle, _ = watched
+    before, after = watch.residual_px["cluster heads"], watch.residual_px["adjusted map"]
+    assert len(before) == len(after) == len(bundle.corners)
+    assert (after >= 0).all() and after.median() < before.median()
+    assert torch.equal(pixel_residuals(bundle), after)

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.documents import plain
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.report.iteration import Iteration
+from crowdmap_torch.runs.metrics import metrics_of
+from crowdmap_torch.tables import Dataset
+
+
+@pytest.fixture(scope="module")
+def metrics(tiny: Dataset, tiny_result: MapResult) -> dict:
+    """What metrics.json would hold of the tiny dataset's map."""
+    iterations = (Iteration(1, {"sign_reprojection": 2.0, "lane": 1.0}, 1e-4, 0.9, 0.1),)
+    found = metrics_of(tiny, tiny_result, MapperConfig(), iterations, {"adjust": 1.5}, None, None)
+    return json.loads(json.dumps(plain(found), allow_nan=False))
+
+
+def test_signs_of_the_map_are_certain_or_tentative(metrics, tiny_result: MapResult):
+    counts = metrics["counts"]
+    assert counts["signs of the map"] + counts["tentative signs"] == len(tiny_result.hd_map.signs)
+    assert counts["sign detections used"] <= counts["sign detections"]
+
+
+def test_detections_used_are_those_of_all_journeys(metrics):
+    journeys, counts = metrics["journeys"], metrics["counts"]
+    assert sum(j["sign_detections_used"] for j in journeys) == counts["sign detections used"]
+    assert sum(j["frames"] for j in journeys) == counts["frames"]
+    assert all(j["length_m"] > 0 for j in journeys)
+
+
+def test_the_cost_of_a_step_is_the_sum_of_its_terms(metrics):
+    (step,) = metrics["costs"]
+    assert step["total"] == step["sign_reprojection"] + step["lane"] == 3.0
+
+
+def test_covariances_of_corners_are_symmetric_one_for_each_corner(metrics, tiny_result: MapResult):
+    signs = tiny_result.hd_map.signs
+    corners = polygon.corner_count(signs.shape).tolist()
+    assert metrics["sign_corners"]
+    for row, entry in enumerate(metrics["sign_corners"]):
+        assert entry["sign_id"] == tiny_result.hd_map.sign_id[row]
+        covariance = torch.tensor(entry["covariance"], dtype=torch.float64).view(-1, 3, 3)
+        assert len(covariance) == corners[row]
+        assert torch.allclose(covariance, covariance.mT, atol=1e-12)
+
+
+def test_without_a_survey_there_are_no_figures(metrics):
+    assert metrics["survey"] is None
+    assert metrics["survey_clusters"] is None

@@ -1,0 +1,114 @@
+"""The command line: what can be chosen, what is imported for it, and how it ends."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from crowdmap_torch import __version__, benchmark, studies
+from crowdmap_torch.cli import COMMANDS, main
+from crowdmap_torch.commands.benchmark import BENCHMARKS
+from crowdmap_torch.commands.study import STUDIES
+
+ROOT = Path(__file__).parents[1]
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """How a fresh interpreter ends."""
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"crowdmap {__version__}\n"
+
+
+def test_nothing_chosen_is_wrong_input(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stop:
+        main([])
+    assert stop.value.code == 2
+    assert "NAME" in capsys.readouterr().err
+
+
+def test_wrong_input_is_one_line_and_two(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    assert main(["benchmark", "association", str(tmp_path / "none")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("crowdmap benchmark association: ") and error.count("\n") == 1
+
+
+def test_what_the_program_gets_wrong_is_not_called_wrong_input(monkeypatch: pytest.MonkeyPatch):
+    def mistaken(options: object) -> None:
+        raise ValueError("a mistake of the program")
+
+    monkeypatch.setattr("crowdmap_torch.benchmark.cluster.run", mistaken)
+    with pytest.raises(ValueError, match="a mistake of the program"):
+        main(["benchmark", "cluster"])
+
+
+def test_the_list_of_subcommands_loads_none_of_them():
+    code = "import sys, crowdmap_torch.cli as cli; cli.main(['--help'])"
+    ended = python("-X", "importtime", "-c", code)
+    assert ended.returncode == 0 and "optimize" in ended.stdout
+    assert "torch._C" not in ended.stderr and "numpy" not in ended.stderr
+
+
+def test_threads_are_told_to_sleep_before_torch_is_loaded():
+    code = (
+        "import os, sys, importlib.abc\n"
+        "class Watch(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'torch': sys.exit(os.environ.get('OMP_WAIT_POLICY'))\n"
+        "sys.meta_path.insert(0, Watch())\n"
+        "from crowdmap_torch.cli import main\n"
+        "main(['optimize', 'DATA', '--out', 'RUN'])\n"
+    )
+    assert python("-c", code).stderr.strip() == "PASSIVE"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_scripts_are_commands(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    script = ROOT / "scripts" / f"{name}.py"
+    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(str(script), run_name="__main__")
+    assert stop.value.code == 0
+    assert capsys.readouterr().out.startswith(f"usage: crowdmap {name} ")
+
+
+def test_the_package_is_the_command_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["-m", "--version"])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_module("crowdmap_torch", run_name="__main__")
+    assert stop.value.code == 0
+    assert capsys.readouterr().out.startswith("crowdmap ")
+
+
+def test_every_script_is_a_command():
+    assert {path.stem for path in (ROOT / "scripts").glob("*.py")} == set(COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("package", "names"), [(studies, STUDIES), (benchmark, BENCHMARKS)], ids=lambda p: None
+)
+def test_every_module_that_can_be_run_is_listed(package, names: dict[str, str]):
+    modules = {
+        module.name: importlib.import_module(f"{package.__name__}.{module.name}")
+        for module in pkgutil.iter_modules(package.__path__)
+        if not module.ispkg
+    }
+    runnable = {name for name, module in modules.items() if hasattr(module, "run")}
+    assert runnable == {name.replace("-", "_") for name in names}

@@ -1,0 +1,77 @@
+"""What the pages say: links lead somewhere, names exist, and nothing outside the repository is cited."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import architecture
+import pytest
+import yaml
+
+from crowdmap_torch import __version__
+from crowdmap_torch.geometry import polygon
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+SOURCES = sorted(
+    path
+    for folder in ("crowdmap_torch", "scripts", "tests", "configs", "docs")
+    for path in (ROOT / folder).rglob("*")
+    if path.suffix in (".py", ".yaml", ".toml", ".patch")
+)
+
+
+def text(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path):
+    links = re.findall(r"\]\((?!https?:)([^)#\s]+)[^)]*\)", text(page))
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_pages_that_are_cited_are_in_the_repository():
+    known = {page.name for page in PAGES}
+    for path in (*SOURCES, *PAGES, ROOT / "Makefile", ROOT / "pyproject.toml"):
+        cited = set(re.findall(r"\b[A-Za-z]+\.md\b", text(path)))
+        assert cited <= known, f"{path}: {sorted(cited - known)}"
+
+
+def test_nothing_outside_the_repository_is_cited():
+    # Where the real data may be is said in conftest.py alone; without them those tests skip.
+    outside = re.compile(r"\.\./" + "shared|/" + r"work/|(?<![\w.])/" + "tmp/")
+    for path in (*SOURCES, *PAGES):
+        if path != ROOT / "tests" / "conftest.py":
+            assert not outside.search(text(path)), path
+
+
+def test_terms_of_the_glossary_live_where_it_says():
+    rows = re.findall(r"^\| (?!term |---)(.+)\|$", text(ROOT / "docs" / "GLOSSARY.md"), flags=re.M)
+    assert len(rows) > 40
+    rooms = {name.rpartition(".")[0] for name in architecture.modules()}
+    for row in rows:
+        term, _, _, places = (cell.strip() for cell in row.split("|"))
+        homes = re.findall(r"`([\w.]+)`", places)
+        assert homes, f"{term}: no module"
+        assert set(homes) <= {*architecture.modules(), *rooms}, f"{term}: {homes}"
+
+
+def test_modules_that_pages_name_exist():
+    for page in PAGES:
+        named = re.findall(r"`(?:crowdmap_torch/)?((?:\w+/)+\w+\.py)`", text(page))
+        folders = (ROOT, ROOT / "crowdmap_torch")
+        lost = [name for name in named if not any((folder / name).exists() for folder in folders)]
+        assert lost == [], page
+
+
+def test_the_format_has_a_row_for_every_shape():
+    rows = re.findall(r"^\| `(\w+)` \| (\d) \|", text(ROOT / "docs" / "FORMAT.md"), flags=re.M)
+    counts = zip(polygon.SHAPES, polygon.CORNER_COUNT.tolist(), strict=True)
+    assert sorted((name, int(count)) for name, count in rows) == sorted(counts)
+
+
+def test_the_citation_names_this_version():
+    cited = yaml.safe_load(text(ROOT / "CITATION.cff"))
+    assert cited["version"] == __version__ and cited["license"] == "Apache-2.0"
