@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 # Before torch: its threads then sleep while they wait, and do not spin. On a busy machine that is several times faster.
@@ -21,7 +22,7 @@ from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.config import config_hash, dump, load_config
 from crowdmap_torch.evaluation.text import format_figures
-from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.errors import input_read
 from crowdmap_torch.io.maps import certain_part
@@ -41,6 +42,7 @@ from crowdmap_torch.runs.folder import (
     refuse_overlap,
 )
 from crowdmap_torch.runs.metrics import metrics_of
+from crowdmap_torch.tables import Dataset, RejectedJourney
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,14 +76,12 @@ def run(options: argparse.Namespace) -> None:
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         config = load_config(options.config)
         device = _device(options.device)
-        dataset = load_dataset(options.dataset, device=device, strict=options.strict)
+        dataset = _load(options.dataset, device, strict=options.strict)
         survey = read_survey_of(options.dataset, dataset.origin)
         truth = read_truth_of(options.dataset, dataset, survey)
         control = None
         if options.control is not None:
             control = read_survey_at(options.control, dataset.origin)
-    for rejected in dataset.rejected:
-        print(f"set aside {rejected.journey_id}: {rejected.reason}", file=sys.stderr)
     findings = look_over(options.dataset, dataset, config.positioning, config.sign_association)
     for finding in findings:
         print(f"looks wrong: {finding.line(len(dataset.journeys))}", file=sys.stderr)
@@ -143,6 +143,22 @@ def run(options: argparse.Namespace) -> None:
     write_report(folder.report, record)
     print(f"map: {folder.map}")
     print(f"report: {folder.report}")
+
+
+def _load(folder: Path, device: torch.device, *, strict: bool) -> Dataset:
+    """The dataset; every journey that is set aside is named, also where none is left."""
+    try:
+        dataset = load_dataset(folder, device=device, strict=strict)
+    except NoJourneyLeft as error:
+        _tell_rejected(error.rejected)
+        raise
+    _tell_rejected(dataset.rejected)
+    return dataset
+
+
+def _tell_rejected(rejected: Sequence[RejectedJourney]) -> None:
+    for journey in rejected:
+        print(f"set aside {journey.journey_id}: {journey.reason}", file=sys.stderr)
 
 
 def _device(name: str) -> torch.device:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
+from crowdmap_torch.io.copies import SAME_PX, copies
 from crowdmap_torch.io.detections import (
     DROPPED_LANE,
     DROPPED_SIGN,
@@ -28,8 +30,8 @@ def load_dataset(
 ) -> Dataset:
     """The journeys of a dataset, in the order of their names, and those set aside with the reason.
 
-    InputError if the dataset itself breaks FORMAT.md, if no journey is left, or, `strict`, if a
-    single one is set aside.
+    A drive counts once: copies of a journey are set aside, and what was cut out of it. InputError if the dataset
+    itself breaks FORMAT.md, if no journey is left (`NoJourneyLeft`), or, `strict`, if a single one is set aside.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -52,10 +54,19 @@ def load_dataset(
         journeys.append(journey)
         names.append(type_names)
     if not journeys:
-        raise InputError(
+        raise NoJourneyLeft(
             f"{folder}: all {len(rejected)} journeys are set aside; the first, "
-            f"{rejected[0].journey_id!r}, because {rejected[0].reason}"
+            f"{rejected[0].journey_id!r}, because {rejected[0].reason}",
+            tuple(rejected),
         )
+    doubles = _copies(journeys)
+    if strict and doubles:
+        first = min(doubles)
+        raise InputError(f"journey {first!r}: {doubles[first]}")
+    rejected += [RejectedJourney(journey_id, reason) for journey_id, reason in doubles.items()]
+    rejected.sort(key=lambda aside: aside.journey_id)
+    once = [k for k, journey in enumerate(journeys) if journey.journey_id not in doubles]
+    journeys, names = [journeys[k] for k in once], [names[k] for k in once]
     all_names = tuple(sorted(set().union(*names)))
     recoded = (
         _moved(_recode(journey, own, all_names), device)
@@ -76,6 +87,15 @@ def load_journey(
     folder = Path(path)
     journey, type_names = _load_journey(folder, folder.parent.parent / "rigs", {})
     return _moved(journey, device), type_names
+
+
+class NoJourneyLeft(InputError):
+    """All journeys of a dataset are set aside."""
+
+    def __init__(self, text: str, rejected: tuple[RejectedJourney, ...]) -> None:
+        super().__init__(text)
+        self.rejected = rejected
+        """Each with its reason."""
 
 
 def read_origin(head: Document) -> Origin:
@@ -144,6 +164,17 @@ def _load_journey(
         dropped=signs.dropped | lanes.dropped,
     )
     return journey, signs.type_names
+
+
+def _copies(journeys: Sequence[Journey]) -> dict[str, str]:
+    """Journeys that are copies of others, and what is said of them."""
+    return {
+        journeys[copy.journey].journey_id: (
+            f"copy of journey {journeys[copy.other].journey_id!r}: {copy.share:.0%} of its "
+            f"detections are that one's, to {SAME_PX} px; a drive counts once"
+        )
+        for copy in copies(journeys)
+    }
 
 
 def _recode(journey: Journey, own: tuple[str, ...], names: tuple[str, ...]) -> Journey:

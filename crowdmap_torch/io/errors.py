@@ -20,5 +20,7 @@ def input_read() -> Iterator[None]:
     """Inside, a value or a file that is wrong is wrong input: a ValueError or OSError leaves as an InputError."""
     try:
         yield
+    except InputError:
+        raise
     except (ValueError, OSError) as error:
         raise InputError(one_line(error)) from error

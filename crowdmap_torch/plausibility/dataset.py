@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from crowdmap_torch.io.columns import Sheet
+from crowdmap_torch.io.copies import overlaps
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.plausibility.consistency import consistency_findings
 from crowdmap_torch.plausibility.detections import Outlines, detection_findings
@@ -36,7 +37,7 @@ def look_over(
         for journey in dataset.journeys
         for finding in _findings_of(folder / "journeys" / journey.journey_id, journey, dataset)
     ]
-    found += list(_copies(dataset.journeys))
+    found += list(_overlaps(dataset.journeys))
     spoiled = {journey for journey, finding in found if finding.kind not in _HARMLESS}
     sound = [j for j in dataset.journeys if j.journey_id not in spoiled and len(j.signs)]
     some = sound[:: -(-len(sound) // _MOST_TRIANGULATED)] if sound else []
@@ -48,7 +49,7 @@ def look_over(
     return gathered(found)
 
 
-_HARMLESS = ("sigmas", "copies", "road-normal", "camera-height", "leap")
+_HARMLESS = ("sigmas", "overlap", "road-normal", "camera-height", "leap")
 """Findings that do not keep the rays to a sign from meeting."""
 
 
@@ -66,22 +67,16 @@ def _outlines(path: Path) -> Outlines:
     return Outlines(np.stack((u.values, v.values), axis=-1), u.count)
 
 
-def _copies(journeys: Sequence[Journey]) -> Iterator[tuple[str, Finding]]:
-    """Journeys whose detections are those of another one to the last bit."""
-    first: dict[bytes, str] = {}
-    for journey in journeys:
-        if not len(journey.signs) + len(journey.lanes):
-            continue
-        seen = (journey.signs.corners_px, journey.lane_points.px, journey.T_world_camera)
-        key = b"".join(part.cpu().numpy().tobytes() for part in seen)
-        known = first.setdefault(key, journey.journey_id)
-        if known != journey.journey_id:
-            yield (
-                journey.journey_id,
-                Finding(
-                    "copies",
-                    f"poses and detections are those of {known!r}",
-                    "one drive was uploaded more than once",
-                    "remove the copies: the map takes each for a drive of its own",
-                ),
-            )
+def _overlaps(journeys: Sequence[Journey]) -> Iterator[tuple[str, Finding]]:
+    """Journeys that repeat a part of another one; those that repeat most of it were set aside at the door."""
+    for overlap in overlaps(journeys):
+        other = journeys[overlap.other].journey_id
+        yield (
+            journeys[overlap.journey].journey_id,
+            Finding(
+                "overlap",
+                f"{overlap.share:.0%} of the detections are those of {other!r}",
+                "one drive was cut into journeys that overlap",
+                "cut it anew: the map takes what is in two journeys for two drives",
+            ),
+        )

@@ -6,7 +6,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -377,11 +377,20 @@ def test_a_bad_journey_with_strict_is_one_line(optimize, copy: Path, tmp_path: P
     assert_refused(said, tmp_path / "run", "journey-001", "poses.parquet", "'x'")
 
 
-def test_journeys_that_are_all_bad_are_one_line(optimize, copy: Path, tmp_path: Path):
-    for journey in journeys_of(copy):
-        spoil_pose(journey)
+def test_journeys_that_are_all_bad_are_a_line_each_and_one_for_all(
+    optimize, copy: Path, tmp_path: Path
+):
+    first, second, third = journeys_of(copy)
+    spoil_pose(first)
+    spoil_pose(second)
+    (third / "lanes.parquet").unlink()
     said = optimize(copy, tmp_path / "run")
-    assert_refused(said, tmp_path / "run", "all 3 journeys are set aside", "journey-000")
+    *aside, last = said.err.splitlines()
+    assert [line.split(": ")[0] for line in aside] == [
+        f"set aside {journey.name}" for journey in (first, second, third)
+    ]
+    assert "'x'" in aside[0] and "lanes.parquet" in aside[2]
+    assert_refused(replace(said, err=f"{last}\n"), tmp_path / "run", "all 3 journeys", first.name)
 
 
 # Datasets with little in them.

@@ -161,12 +161,16 @@ def sound(tmp_path: Path) -> TinyDataset:
         name: {"format": "crowdmap-journey", "version": 1, "journey_id": name, "rig": name}
         for name in names
     }
+    journeys = {name: TinyJourney(heads[name]) for name in names}
+    for detections in (journeys["a"].signs, journeys["a"].lanes):
+        # Two drives never have the same outlines.
+        detections["v"] = [[v + 0.25 for v in row] for row in detections["v"]]
     return TinyDataset(
         folder=tmp_path / "dataset",
         head={"format": "crowdmap-dataset", "version": 1, "origin": dict(ORIGIN)},
         rigs=rigs,
         urdfs={"a": URDF},
-        journeys={name: TinyJourney(heads[name]) for name in names},
+        journeys=journeys,
     )
 
 

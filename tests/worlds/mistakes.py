@@ -212,14 +212,19 @@ def _no_sigmas(c: dict) -> dict:
     return c | {name: zero for name in ("sigma_e", "sigma_n", "sigma_u", "sigma_rot")}
 
 
-def _copies(folder: Path) -> None:
+def _overlap(folder: Path) -> None:
+    """The first drive becomes two, which share an eighth of its frames."""
     first = sorted((folder / "journeys").iterdir())[0]
-    for number in range(3):
-        name = f"again-{number}"
-        shutil.copytree(first, folder / "journeys" / name)
-        head = json.loads((folder / "journeys" / name / "journey.json").read_text())
-        text = json.dumps(head | {"journey_id": name})
-        (folder / "journeys" / name / "journey.json").write_text(text)
+    second = Path(shutil.copytree(first, folder / "journeys" / "second-half"))
+    head = json.loads((second / "journey.json").read_text())
+    (second / "journey.json").write_text(json.dumps(head | {"journey_id": second.name}))
+    frames = pq.read_table(first / "poses.parquet")["frame"].to_numpy()
+    n = len(frames)
+    for journey, kept in ((first, frames[: 5 * n // 8]), (second, frames[n // 2 :])):
+        for name in ("poses", "signs", "lanes"):
+            table = pq.read_table(journey / f"{name}.parquet")
+            is_kept = np.isin(table["frame"].to_numpy(), kept)
+            pq.write_table(table.filter(pa.array(is_kept)), journey / f"{name}.parquet")
 
 
 MISTAKES: dict[str, Callable[[Path], None]] = {
@@ -244,6 +249,6 @@ MISTAKES: dict[str, Callable[[Path], None]] = {
     "road-normal": _road("normal", lambda n: [-float(x) for x in n]),  # type: ignore[union-attr]
     "camera-height": _road("height_m", lambda h: 100 * float(h)),  # type: ignore[arg-type]
     "sigmas": lambda folder: _each(folder, "poses", _no_sigmas),
-    "copies": _copies,
+    "overlap": _overlap,
 }
 """Mistakes by the kind of finding that names each."""
