@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "ARCHITECTURE.md"
 PACKAGE = "crowdmap_torch"
 FLOORS = (
+    ("ranges",),
     ("geometry", "optim", "clustering"),
     ("tables",),
     ("residuals",),

@@ -39,6 +39,11 @@ def evaluate_association(
     outlier = torch.cat([t.sign_outlier for t in truth.journeys] or [observable[:0]])
     rows = torch.tensor([len(t.sign) for t in truth.journeys], device=sign.device)
     start = rows.cumsum(0) - rows
+    if bool((associations.row >= rows[associations.journey]).any()):
+        raise ValueError(
+            "associations.parquet has rows that the journeys' signs.parquet have not: "
+            "is it the run of another dataset?"
+        )
     landmark = torch.full_like(sign, -1)
     landmark[start[associations.journey] + associations.row] = associations.landmark
     true = sign >= 0

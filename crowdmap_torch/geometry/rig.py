@@ -53,9 +53,16 @@ def camera_in_link(
     return se3.make(R, T_link_camera[:3, 3])
 
 
+_MOST_LINKS = 2000
+"""A humanoid has a hundred."""
+
+
 def _parse(urdf: bytes | str | PathLike[str]) -> URDF:
     # Bytes, not text: the parser refuses a str that names its encoding in the first line.
     content = urdf if isinstance(urdf, bytes) else Path(urdf).read_bytes()
+    # Entities may unfold without end, or name other files; nobody describes a robot with them.
+    if b"<!" in content.replace(b"<!--", b"").replace(b"\0", b""):
+        raise ValueError("URDF cannot be read: it has a DOCTYPE or entities; expected neither")
     try:
         # The parser reports tags it does not know on stderr; they are no fault.
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
@@ -67,7 +74,9 @@ def _parse(urdf: bytes | str | PathLike[str]) -> URDF:
 
 def _tree(robot: URDF) -> dict[str, Joint | None]:
     """The joint above each link, None above the root, of a description that is one tree."""
-    names = [link.name for link in robot.links]
+    names = [str(link.name) for link in robot.links]
+    if max(len(names), len(robot.joints)) > _MOST_LINKS:
+        raise ValueError(f"URDF has {len(names)} links; expected {_MOST_LINKS} at most")
     if not names:
         raise ValueError("URDF has no links; expected a <robot> with at least one <link>")
     if twice := sorted({n for n in names if names.count(n) > 1}):

@@ -8,6 +8,7 @@ with these keys under `points` or `pixels`.
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from pathlib import Path
@@ -15,8 +16,11 @@ from pathlib import Path
 import torch
 
 from crowdmap_torch.io.atomic import atomic_file
+from crowdmap_torch.io.budget import read_text
+from crowdmap_torch.io.columns import MAX_PLACE_M
 from crowdmap_torch.io.documents import read_yaml
 from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.ranges import shown
 from crowdmap_torch.road.calibration import Annotations, RoadCalibration, SurveyedPoints
 
 SURFACES = ("wall", "floor")
@@ -74,10 +78,7 @@ def read_annotations(path: Path, points: SurveyedPoints) -> Annotations:
 
 def write_rig_road(path: Path, calibration: RoadCalibration) -> None:
     """Writes the section `road` of a rig.yaml, or replaces it; everything else stays as it is."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    text = read_text(path)
     normal = ", ".join(repr(x) for x in calibration.normal_camera.tolist())
     road = f"road:\n  normal: [{normal}]\n  height_m: {calibration.height!r}\n"
     # The section reaches to the next line that begins at the margin.
@@ -115,18 +116,15 @@ def _read_rows(
 
 def _read_csv(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str, object]]]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            head = tuple(reader.fieldnames or ())
-            missing = [c for c in columns if c not in head]
-            if missing:
-                raise InputError(
-                    f"{path}: column {missing[0]!r} is missing; expected {', '.join(columns)}"
-                )
-            return [(reader.line_num, dict(row)) for row in reader]
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: the file is missing") from error
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reader = csv.DictReader(io.StringIO(read_text(path), newline=""), skipinitialspace=True)
+        head = tuple(reader.fieldnames or ())
+        missing = [c for c in columns if c not in head]
+        if missing:
+            raise InputError(
+                f"{path}: column {missing[0]!r} is missing; expected {', '.join(columns)}"
+            )
+        return [(reader.line_num, dict(row)) for row in reader]
+    except csv.Error as error:
         raise InputError(f"{path}: cannot be read as CSV ({one_line(error)})") from error
 
 
@@ -134,10 +132,11 @@ def _number(path: Path, number: int, row: dict[str, object], column: str) -> flo
     value = row[column]
     try:
         result = float(value) if isinstance(value, str | int | float) else math.nan
-    except ValueError:
+    except (ValueError, OverflowError):
         result = math.nan
-    if not math.isfinite(result):
+    if not abs(result) <= MAX_PLACE_M:
         raise InputError(
-            f"{path}: row {number}: {column}: expected a finite number, found {value!r}"
+            f"{path}: row {number}: {column}: expected a finite number, {MAX_PLACE_M:g} at most, "
+            f"found {shown(value)}"
         )
     return result

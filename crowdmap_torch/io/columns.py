@@ -11,10 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float, Int
 
+from crowdmap_torch.io.budget import FREE_BYTES, budget_now, file_size
 from crowdmap_torch.io.errors import InputError, one_line
+
+MAX_PLACE_M = 1e6
+"""Nothing that is mapped is further from the origin, in any direction: the plane has left the earth there [m]."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +105,9 @@ class Sheet:
         column = self._column(name, _is_text, "string", nullable=optional)
         if column is None:
             return pa.nulls(len(self), pa.string())
-        texts = column.cast(pa.string())
+        self._refuse_long(name, column)
         try:
+            texts = column.cast(pa.string())
             texts.validate(full=True)
         except pa.ArrowInvalid as error:
             raise self.fault(f"column {name!r}: expected UTF-8 ({one_line(error)})") from error
@@ -159,7 +165,9 @@ class Sheet:
     def points(self, name: str, *, optional: bool = False) -> Lists:
         """A point of three numbers in each row; where `optional`, `count` is 0 for none."""
         lists = self.number_lists(name, 3, optional=optional)
-        return Lists(lists.values.reshape(-1, 3), lists.count // 3)
+        points = Lists(lists.values.reshape(-1, 3), lists.count // 3)
+        self._refuse_far(name, points)
+        return points
 
     def point_lists(self, name: str, *, optional: bool = False) -> Lists:
         """Lists of points of three numbers; where `optional`, a row may have none (`count` 0)."""
@@ -181,7 +189,31 @@ class Sheet:
                 f"column {name!r}: a point has {size[bad]} numbers; expected 3", int(row[bad])
             )
         values = self._values(name, inner.flatten(), np.repeat(row, 3))
-        return Lists(values.reshape(-1, 3), count)
+        points = Lists(values.reshape(-1, 3), count)
+        self._refuse_far(name, points)
+        return points
+
+    def _refuse_far(self, name: str, points: Lists) -> None:
+        """Refuses points that are not near the origin, as nothing in these files is."""
+        far = np.abs(points.values).max(axis=-1, initial=0.0) > MAX_PLACE_M
+        if far.any():
+            at = int(far.argmax())
+            place = ", ".join(f"{x:.7g}" for x in points.values[at])
+            raise self.fault(
+                f"column {name!r}: ({place}) is over {MAX_PLACE_M / 1000:,.0f} km from the origin; "
+                "expected metres east, north and up of it",
+                int(points.row[at]),
+            )
+
+    def _refuse_long(self, name: str, column: pa.Array) -> None:
+        """Refuses texts that repeat until they fill the memory."""
+        if not pa.types.is_dictionary(column.type):
+            return
+        count = np.bincount(column.indices.drop_null().to_numpy(), minlength=len(column.dictionary))
+        length = pc.call_function("binary_length", [column.dictionary]).fill_null(0).to_numpy()
+        most = min(budget_now().decoded_bytes, 2**31 - 1)
+        if (found := int(count.astype(np.int64) @ length.astype(np.int64))) > most:
+            raise self.fault(f"column {name!r}: {found} bytes of text; expected {most} at most")
 
     def _values(
         self, name: str, flat: pa.Array, row: Int[np.ndarray, " p"]
@@ -206,7 +238,9 @@ class Sheet:
             # Nobody can tell the type of a column without a value; it is what was expected.
             return None if nullable else pa.array([], _EMPTY[expected])
         if not fits(column.type):
-            raise self.fault(f"column {name!r} has type {column.type}; expected {expected}")
+            is_coded = pa.types.is_dictionary(column.type)
+            found = column.type.value_type if is_coded else column.type
+            raise self.fault(f"column {name!r} has type {found}; expected {expected}")
         if not nullable and column.null_count:
             row = int(column.is_null().to_numpy(zero_copy_only=False).argmax())
             raise self.fault(f"column {name!r} is null; expected a value in every row", row)
@@ -224,17 +258,50 @@ _EMPTY = {
 
 
 def _read(path: Path, required: Sequence[str], optional: Sequence[str]) -> pa.Table:
-    if not path.is_file():
-        found = "a folder is there instead" if path.is_dir() else "the file is missing"
-        raise InputError(f"{path}: {found}; expected a Parquet file (with no rows if need be)")
+    try:
+        size = file_size(path, budget_now().table_bytes)
+    except InputError as error:
+        raise InputError(f"{error}; expected a Parquet file (with no rows if need be)") from error
     try:
         with pq.ParquetFile(path) as file:
             names = file.schema_arrow.names
             wanted = [name for name in (*required, *optional) if name in names]
             _check_names(path, names, required, wanted)
+            _weigh(path, size, file.metadata, wanted)
+            texts = [name for name in wanted if _is_text(file.schema_arrow.field(name).type)]
+        # Texts stay what they are in the file, numbers of a list: a long one in every row would fill the memory.
+        with pq.ParquetFile(path, read_dictionary=texts) as file:
             return file.read(columns=wanted)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, *_ARROW_TRIPS) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: cannot be read as Parquet ({one_line(error)})") from error
+
+
+_ARROW_TRIPS = (ValueError, TypeError, KeyError, OverflowError, MemoryError)
+"""What pyarrow raises beside its own exceptions where a file's schema makes no sense."""
+
+
+def _weigh(path: Path, size: int, footer: pq.FileMetaData, wanted: Sequence[str]) -> None:
+    """Refuses a file whose footer claims more than the budget, or what a file of its size cannot hold."""
+    budget = budget_now()
+    groups = [footer.row_group(k) for k in range(footer.num_row_groups)]
+    rows = [group.num_rows for group in groups]
+    chunks = [group.column(k) for group in groups for k in range(group.num_columns)]
+    chunks = [chunk for chunk in chunks if chunk.path_in_schema.split(".")[0] in wanted]
+    # A number takes eight bytes, whether it is one or a text's place in a list of texts.
+    decoded = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
+    stored = [chunk.total_compressed_size for chunk in chunks]
+    least = (*rows, *stored, *(c.num_values for c in chunks), 0)
+    if sum(rows) != footer.num_rows or min(least) < 0 or sum(stored) > size:
+        raise InputError(f"{path}: cannot be read as Parquet (its footer contradicts itself)")
+    if footer.num_rows > budget.rows:
+        raise InputError(f"{path}: claims {footer.num_rows} rows; expected {budget.rows} at most")
+    most = min(budget.decoded_bytes, FREE_BYTES + budget.expansion * size)
+    if decoded > most:
+        raise InputError(
+            f"{path}: {size} bytes claim to hold {decoded} bytes of numbers; expected {most} at most"
+        )
 
 
 def _check_names(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
+from crowdmap_torch.io.budget import reading, refuse_way_out
 from crowdmap_torch.io.copies import SAME_PX, copies
 from crowdmap_torch.io.detections import (
     DROPPED_LANE,
@@ -16,7 +18,7 @@ from crowdmap_torch.io.detections import (
     read_sign_detections,
 )
 from crowdmap_torch.io.documents import Document, read_json
-from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.poses import read_poses
 from crowdmap_torch.io.rigs import read_rig
 from crowdmap_torch.tables import Dataset, Journey, Origin, RejectedJourney, Rig
@@ -36,6 +38,13 @@ def load_dataset(
     folder = Path(path)
     if not folder.is_dir():
         raise InputError(f"{folder}: the dataset's folder is missing; expected dataset.json in it")
+    with reading(inside=folder):
+        dataset = _load_dataset(folder, strict)
+    moved = tuple(_moved(journey, device) for journey in dataset.journeys)
+    return replace(dataset, journeys=moved)
+
+
+def _load_dataset(folder: Path, strict: bool) -> Dataset:
     head = read_json(folder / "dataset.json")
     head.require_format(DATASET_FORMAT)
     origin = read_origin(head)
@@ -47,9 +56,10 @@ def load_dataset(
         try:
             journey, type_names = _load_journey(journey_folder, folder / "rigs", rigs)
         except InputError as error:
+            name = _printable(journey_folder.name)
             if strict:
-                raise InputError(f"journey {journey_folder.name!r}: {error}") from error
-            rejected.append(RejectedJourney(journey_folder.name, str(error)))
+                raise InputError(f"journey {name!r}: {one_line(error)}") from error
+            rejected.append(RejectedJourney(name, one_line(error)))
             continue
         journeys.append(journey)
         names.append(type_names)
@@ -69,8 +79,7 @@ def load_dataset(
     journeys, names = [journeys[k] for k in once], [names[k] for k in once]
     all_names = tuple(sorted(set().union(*names)))
     recoded = (
-        _moved(_recode(journey, own, all_names), device)
-        for journey, own in zip(journeys, names, strict=True)
+        _recode(journey, own, all_names) for journey, own in zip(journeys, names, strict=True)
     )
     return Dataset(
         origin=origin, journeys=tuple(recoded), rejected=tuple(rejected), type_names=all_names
@@ -85,7 +94,8 @@ def load_journey(
     InputError if it breaks FORMAT.md.
     """
     folder = Path(path)
-    journey, type_names = _load_journey(folder, folder.parent.parent / "rigs", {})
+    with reading(inside=folder.parent.parent):
+        journey, type_names = _load_journey(folder, folder.parent.parent / "rigs", {})
     return _moved(journey, device), type_names
 
 
@@ -120,7 +130,10 @@ def _journey_folders(folder: Path) -> list[Path]:
     journeys = folder / "journeys"
     if not journeys.is_dir():
         raise InputError(f"{journeys}: the folder is missing; expected one folder for each journey")
-    found = [p for p in journeys.iterdir() if p.is_dir() and not p.name.startswith(".")]
+    refuse_way_out(journeys)
+    entries = (p for p in journeys.iterdir() if not p.name.startswith("."))
+    # A link may be a journey that went astray: it is not passed over as other files are.
+    found = [p for p in entries if p.is_dir() or p.is_symlink()]
     if not found:
         raise InputError(f"{journeys}: has no journeys; expected one folder for each journey")
     return sorted(found)
@@ -130,6 +143,9 @@ def _load_journey(
     folder: Path, rigs_folder: Path, rigs: dict[str, Rig | InputError]
 ) -> tuple[Journey, tuple[str, ...]]:
     """A journey with the codes of its own signs; `rigs` keeps rigs, or what is wrong with them."""
+    refuse_way_out(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: a link that leads to no folder; expected a journey's folder")
     head = read_json(folder / "journey.json")
     head.require_format(JOURNEY_FORMAT)
     journey_id = head.name("journey_id")
@@ -140,6 +156,7 @@ def _load_journey(
     rig_id = head.name("rig")
     if rig_id not in rigs:
         try:
+            refuse_way_out(rigs_folder / rig_id)
             rigs[rig_id] = read_rig(rigs_folder / rig_id)
         except InputError as error:
             rigs[rig_id] = error
@@ -175,6 +192,12 @@ def _copies(journeys: Sequence[Journey]) -> dict[str, str]:
         )
         for copy in copies(journeys)
     }
+
+
+def _printable(name: str) -> str:
+    """A folder's name on one line, whatever bytes it has."""
+    text = os.fsencode(name).decode("utf-8", "backslashreplace")
+    return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def _recode(journey: Journey, own: tuple[str, ...], names: tuple[str, ...]) -> Journey:

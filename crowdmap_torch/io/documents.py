@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -15,7 +16,9 @@ import yaml
 from torch import Tensor
 
 from crowdmap_torch.io.atomic import atomic_file
+from crowdmap_torch.io.budget import budget_now, read_text
 from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.ranges import shown
 
 
 class Document:
@@ -64,9 +67,16 @@ class Document:
     def name(self, key: str) -> str:
         """A string that can be the name of one file or folder and nothing else."""
         value = self.text(key)
-        if value in (".", "..") or any(c in value for c in "/\\\0"):
-            raise self.fault(f"expected the plain name of a folder, found {value!r}", key)
-        return value
+        if value in (".", "..") or any(c in value for c in "/\\") or not value.isprintable():
+            raise self.fault(f"expected the plain name of a folder, found {shown(value)}", key)
+        return self._short(value, key)
+
+    def place(self, key: str) -> str:
+        """A string that can be the path of a file."""
+        value = self.text(key)
+        if not value.isprintable():
+            raise self.fault(f"expected the path of a file, found {shown(value)}", key)
+        return self._short(value, key)
 
     def integer(self, key: str, *, low: int, high: int) -> int:
         """A whole number in `low` to `high`."""
@@ -80,59 +90,66 @@ class Document:
         """A finite number in `low` to `high`."""
         return self._finite(self.take(key), key, low, high)
 
-    def positive(self, key: str) -> float:
-        """A finite number above zero."""
-        value = self.number(key)
-        if value <= 0:
-            raise self.fault(f"expected a number above 0, found {value!r}", key)
-        return value
-
-    def numbers(self, key: str, count: int | None = None) -> list[float]:
-        """A list of finite numbers, `count` of them if that is given."""
+    def numbers(self, key: str, count: int | None = None, *, most: float = math.inf) -> list[float]:
+        """A list of finite numbers of size `most` at the most, `count` of them if that is given."""
         values = self.take(key)
         if not isinstance(values, list) or (count is not None and len(values) != count):
             found = _kind(values) if not isinstance(values, list) else f"{len(values)} values"
             much = "numbers" if count is None else f"{count} numbers"
             raise self.fault(f"expected a list of {much}, found {found}", key)
-        return [self._finite(v, f"{key}[{k}]", -math.inf, math.inf) for k, v in enumerate(values)]
+        return [self._finite(v, f"{key}[{k}]", -most, most) for k, v in enumerate(values)]
 
     def require_format(self, name: str) -> None:
         """Refuses a file that is of another kind or version."""
         if (found := self.take("format")) != name:
-            raise self.fault(f"expected {name!r}, found {found!r}", "format")
+            raise self.fault(f"expected {name!r}, found {_kind(found)}", "format")
         version = self.take("version")
         if isinstance(version, bool) or not isinstance(version, int) or version != 1:
-            raise self.fault(f"expected version 1, found {version!r}; convert the file", "version")
+            raise self.fault(
+                f"expected version 1, found {_kind(version)}; convert the file", "version"
+            )
 
     def _finite(self, value: object, key: str, low: float, high: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.fault(f"expected a number, found {_kind(value)}", key)
         number = float(value) if abs(value) < 1e300 else math.inf
         if not math.isfinite(number):
-            raise self.fault(f"expected a finite number, found {value!r}", key)
+            raise self.fault(f"expected a finite number, found {shown(value)}", key)
         if not low <= number <= high:
             raise self.fault(f"expected a number in {low:g} to {high:g}, found {number!r}", key)
         return number
 
+    def _short(self, value: str, key: str) -> str:
+        size, most = len(value.encode()), budget_now().name_bytes
+        if size > most:
+            raise self.fault(f"a name of {size} bytes; expected {most} at most", key)
+        return value
+
 
 def read_json(path: Path) -> Document:
     """The object that a JSON file holds; NaN, infinity and a key given twice are refused."""
+    text = read_text(path)
     try:
-        content = json.loads(
-            _read_text(path), parse_constant=_refuse_constant, object_pairs_hook=_unique
-        )
-    except (ValueError, RecursionError) as error:
+        _weigh_json(text)
+        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    except ValueError as error:
         raise _unreadable(path, "JSON", error) from error
     return Document(path, content)
 
 
 def read_yaml(path: Path) -> Document:
     """The mapping that a YAML file holds; a key given twice is refused, `1e-5` is a number."""
+    return Document(path, read_yaml_content(path))
+
+
+def read_yaml_content(path: Path) -> object:
+    """The same, whatever the file holds; None for an empty one."""
+    text = read_text(path)
     try:
-        content = yaml.load(_read_text(path), Loader=_StrictLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        _weigh_yaml(text)
+        return yaml.load(text, Loader=_StrictLoader)
+    except (yaml.YAMLError, ValueError) as error:
         raise _unreadable(path, "YAML", error) from error
-    return Document(path, content)
 
 
 def write_json(path: Path, content: dict) -> None:
@@ -157,7 +174,11 @@ def plain(value: object) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-class _StrictLoader(yaml.SafeLoader):
+# libyaml's parser takes a tenth of the time, where it was built in.
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _StrictLoader(_SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
         for key_node, _ in node.value:
@@ -179,13 +200,50 @@ _StrictLoader.add_implicit_resolver(
 )
 
 
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: the file is missing") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+_JSON_TEXT = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
+
+
+def _weigh_json(text: str) -> None:
+    """ValueError for more values, or values deeper in each other, than the budget has; nothing is built."""
+    budget = budget_now()
+    marks = np.frombuffer(_JSON_TEXT.sub("", text).encode("utf-8", "replace"), np.uint8)
+    opened, closed = (np.isin(marks, list(pair)) for pair in (b"[{", b"]}"))
+    _refuse_more("values", int(opened.sum() + (marks == ord(",")).sum()) + 1, budget.nodes)
+    depth = np.cumsum(opened.astype(np.int64) - closed)
+    _refuse_more("levels", int(depth.max(initial=0)), budget.depth)
+
+
+def _weigh_yaml(text: str) -> None:
+    """ValueError for more nodes, aliases or depth than the budget has, what aliases repeat counted; nothing is built."""
+    budget = budget_now()
+    nodes = aliases = 0
+    sizes: dict[str, int] = {}
+    open_: list[tuple[str | None, int]] = []
+    for event in yaml.parse(text, Loader=_SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            aliases += 1
+            if event.anchor not in sizes:
+                raise ValueError(f"alias {event.anchor!r} stands before or inside its anchor")
+            nodes += sizes[event.anchor]
+        elif isinstance(event, yaml.CollectionStartEvent):
+            open_.append((event.anchor, nodes))
+            nodes += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = open_.pop()
+            if anchor is not None:
+                sizes[anchor] = nodes - before
+        elif isinstance(event, yaml.ScalarEvent):
+            nodes += 1
+            if event.anchor is not None:
+                sizes[event.anchor] = 1
+        _refuse_more("nodes", nodes, budget.nodes)
+        _refuse_more("aliases", aliases, budget.aliases)
+        _refuse_more("levels", len(open_), budget.depth)
+
+
+def _refuse_more(what: str, found: int, most: int) -> None:
+    if found > most:
+        raise ValueError(f"more than {most} {what}; expected a small file written by people")
 
 
 def _unreadable(path: Path, kind: str, error: Exception) -> InputError:
@@ -201,9 +259,8 @@ def _refuse_constant(name: str) -> float:
 def _unique(pairs: list[tuple[str, object]]) -> dict:
     content = dict(pairs)
     if len(content) < len(pairs):
-        names = [key for key, _ in pairs]
-        twice = next(key for key in names if names.count(key) > 1)
-        raise ValueError(f"key {twice!r} is given twice")
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"key {shown(twice)} is given twice")
     return content
 
 
@@ -213,5 +270,4 @@ def _kind(value: object) -> str:
         return "nothing"
     if isinstance(value, dict | list):
         return f"a {'mapping' if isinstance(value, dict) else 'list'} of {len(value)}"
-    text = one_line(repr(value))
-    return text if len(text) <= 60 else text[:57] + "..."
+    return shown(value)

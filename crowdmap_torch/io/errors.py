@@ -11,8 +11,13 @@ class InputError(ValueError):
 
 
 def one_line(error: object) -> str:
-    """The text of somebody else's error without line breaks."""
-    return " ".join(str(error).split())
+    """The text of somebody else's error without line breaks, cut where it goes on and on."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+_LONGEST = 1000
+"""Characters of an error of others: they may quote what a file holds."""
 
 
 @contextmanager

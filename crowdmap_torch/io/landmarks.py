@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import polygon, se3, spline_length
-from crowdmap_torch.io.columns import Sheet
+from crowdmap_torch.io.columns import MAX_PLACE_M, Sheet
 from crowdmap_torch.io.rigs import UNIT_TOLERANCE
 from crowdmap_torch.io.writing import (
     list_column,
@@ -23,6 +23,8 @@ from crowdmap_torch.io.writing import (
 )
 from crowdmap_torch.tables import LANE_TYPES, ControlPoints, Lanes, Signs
 
+MIN_SIGMA_M = 1e-6
+"""Nobody surveys to a micrometre [m]."""
 DEFAULT_SIGMA_M = 0.02
 """1-sigma per axis of a landmark that comes without one, as a surveyor's has [m]."""
 POINT_SPACING_M = 1.0
@@ -146,6 +148,7 @@ def read_lanes(path: Path) -> tuple[Lanes, tuple[str, ...]]:
             ),
         )
         sigma = sigmas.values
+        _refuse_sigma(sheet, sigma, sigmas.row)
     lanes = Lanes(
         type=torch.from_numpy(sheet.codes("type", LANE_TYPES, optional=True)),
         control_start=torch.from_numpy(control.start),
@@ -233,7 +236,12 @@ def _axes(
 
 def _covariance(sheet: Sheet) -> Float[Tensor, "n 3 3"]:
     if "covariance" in sheet:
-        return torch.from_numpy(sheet.number_lists("covariance", 9).values.reshape(-1, 3, 3))
+        covariance = sheet.number_lists("covariance", 9).values.reshape(-1, 3, 3)
+        sheet.refuse(
+            np.abs(covariance).max(axis=(1, 2), initial=0.0) > MAX_PLACE_M**2,
+            lambda row: f"column 'covariance': expected {MAX_PLACE_M**2:g} m^2 at most",
+        )
+        return torch.from_numpy(covariance)
     variance = torch.from_numpy(read_sigma(sheet)).square()
     return variance[:, None, None] * torch.eye(3, dtype=torch.float64)
 
@@ -241,13 +249,7 @@ def _covariance(sheet: Sheet) -> Float[Tensor, "n 3 3"]:
 def read_sigma(sheet: Sheet) -> Float[np.ndarray, " n"]:
     """The `sigma_m` column, `DEFAULT_SIGMA_M` where it says nothing [m]."""
     sigma = sheet.numbers("sigma_m", optional=True)
-    sheet.refuse(
-        sigma <= 0,
-        lambda row: (
-            f"column 'sigma_m': expected a number above 0, found {sigma[row]}; "
-            "leave it null if it is unknown"
-        ),
-    )
+    _refuse_sigma(sheet, sigma)
     return np.where(np.isnan(sigma), DEFAULT_SIGMA_M, sigma)
 
 
@@ -276,9 +278,26 @@ def _read_support(sheet: Sheet) -> dict[str, Tensor]:
 def _positive(sheet: Sheet, name: str) -> Float[np.ndarray, " n"]:
     values = sheet.numbers(name)
     sheet.refuse(
-        values <= 0, lambda row: f"column {name!r}: expected a number above 0, found {values[row]}"
+        ~((values > 0) & (values <= MAX_PLACE_M)),
+        lambda row: (
+            f"column {name!r}: expected a number above 0, {MAX_PLACE_M:g} at most, found {values[row]}"
+        ),
     )
     return values
+
+
+def _refuse_sigma(
+    sheet: Sheet, sigma: Float[np.ndarray, " n"], row_of: Int[np.ndarray, " n"] | None = None
+) -> None:
+    """Refuses a sigma whose inverse square is no weight; NaN is unknown."""
+    off = (sigma < MIN_SIGMA_M) | (sigma > MAX_PLACE_M)
+    if off.any():
+        at = int(off.argmax())
+        raise sheet.fault(
+            f"column 'sigma_m': expected {MIN_SIGMA_M:g} to {MAX_PLACE_M:g} m, found {sigma[at]}; "
+            "leave it null if it is unknown",
+            at if row_of is None else int(row_of[at]),
+        )
 
 
 def _turning(corners: Tensor) -> Tensor:

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io.atomic import atomic_folder
+from crowdmap_torch.io.budget import reading
+from crowdmap_torch.io.columns import MAX_PLACE_M
 from crowdmap_torch.io.datasets import read_origin
 from crowdmap_torch.io.documents import Document, read_json, write_json
 from crowdmap_torch.io.errors import InputError
@@ -88,10 +90,15 @@ def read_map(path: Path | str) -> HdMap:
     shared part.
     """
     folder = Path(path)
+    with reading(inside=folder):
+        return _read_map(folder)
+
+
+def _read_map(folder: Path) -> HdMap:
     head = read_map_head(folder)
     shared = [0.0] * 9
     if "shared_covariance" in head.content:
-        shared = head.numbers("shared_covariance", 9)
+        shared = head.numbers("shared_covariance", 9, most=MAX_PLACE_M**2)
     signs, sign_id, type_names = read_signs(folder / "signs.parquet")
     lanes, lane_id = read_lanes(folder / "lanes.parquet")
     return HdMap(

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.io.columns import Sheet
+from crowdmap_torch.io.columns import MAX_PLACE_M, Sheet
 from crowdmap_torch.io.rigs import UNIT_TOLERANCE
 from crowdmap_torch.io.writing import write_parquet
 
@@ -19,6 +19,14 @@ _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _SIGMA_POSITION = ("sigma_e", "sigma_n", "sigma_u")
 _SIGMA_ROTATION = "sigma_rot"
+
+
+MAX_SPEED_MPS = 150.0
+"""No car on a road is faster over a second, noise and small jumps of its positioning included."""
+MAX_SIGMA = 1e6
+"""Of a position [m] or rotation [rad]: who knows less knows nothing, and leaves the column out."""
+_MOST_COUNTED = 2**61
+"""Frame numbers and times whose differences are numbers still."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,8 @@ def read_poses(path: Path) -> LinkPoses:
         raise sheet.fault("has no rows; expected one for each camera frame")
     frame, t_ns = (_increasing(sheet, name) for name in ("frame", "t_ns"))
     position = np.stack([sheet.numbers(name) for name in _POSITION], axis=-1)
+    _refuse_far(sheet, position)
+    _refuse_leaps(sheet, frame, t_ns, position)
     quaternion = np.stack([sheet.numbers(name) for name in _QUATERNION], axis=-1)
     length = np.sqrt(np.square(quaternion).sum(-1))
     sheet.refuse(
@@ -84,8 +94,46 @@ def write_poses(path: Path, poses: LinkPoses) -> None:
     write_parquet(path, columns)
 
 
+def _refuse_far(sheet: Sheet, position: Float[np.ndarray, "f 3"]) -> None:
+    def rule(row: int) -> str:
+        place = ", ".join(f"{x:.7g}" for x in position[row])
+        return (
+            f"the position ({place}) is over {MAX_PLACE_M / 1000:,.0f} km from the origin; expected "
+            "metres east, north and up of dataset.json's. Are they UTM or earth-centred coordinates?"
+        )
+
+    sheet.refuse(np.abs(position).max(axis=-1, initial=0.0) > MAX_PLACE_M, rule)
+
+
+def _refuse_leaps(
+    sheet: Sheet,
+    frame: Int[np.ndarray, " f"],
+    t_ns: Int[np.ndarray, " f"],
+    position: Float[np.ndarray, "f 3"],
+) -> None:
+    """Refuses what no car drives within a second or between two frames: another second's jump is noise."""
+    before = np.arange(len(frame))
+    # The first frame a second later, the next one if that is later still, or the last of all.
+    after = np.searchsorted(t_ns, t_ns + 10**9)
+    after = np.clip(after, before, len(frame) - 1)
+    seconds = np.maximum((t_ns[after] - t_ns[before]) * 1e-9, 1.0)
+    way = np.sqrt(np.square(position[after] - position[before]).sum(-1))
+    sheet.refuse(
+        way > MAX_SPEED_MPS * seconds,
+        lambda row: (
+            f"from frame {frame[row]} to frame {frame[after[row]]} the car moves {way[row]:.0f} m in "
+            f"{(t_ns[after[row]] - t_ns[row]) * 1e-9:.3g} s; expected {MAX_SPEED_MPS:g} m/s at most. "
+            "Are positions in metres and t_ns in nanoseconds? Cut the journey where it jumps"
+        ),
+    )
+
+
 def _increasing(sheet: Sheet, name: str) -> Int[np.ndarray, " f"]:
     values = sheet.integers(name)
+    sheet.refuse(
+        np.abs(values.astype(float)) > _MOST_COUNTED,
+        lambda row: f"column {name!r}: {values[row]}; expected {_MOST_COUNTED:g} at most",
+    )
     stays = np.concatenate(([False], values[1:] <= values[:-1]))
     sheet.refuse(
         stays,
@@ -101,9 +149,9 @@ def _sigma(sheet: Sheet, name: str) -> Float[np.ndarray, " f"] | None:
     sigma = sheet.numbers(name, optional=True)
     known = ~np.isnan(sigma)
     sheet.refuse(
-        known & ~(sigma >= 0),
+        known & ~((sigma >= 0) & (sigma <= MAX_SIGMA)),
         lambda row: (
-            f"column {name!r}: expected 0 or more, found {sigma[row]}; "
+            f"column {name!r}: expected 0 or more, {MAX_SIGMA:g} at most, found {sigma[row]}; "
             "leave it null if it is unknown"
         ),
     )

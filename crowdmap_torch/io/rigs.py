@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from crowdmap_torch.geometry.camera import COEFFICIENT_COUNTS, MODELS, Camera, closing_share
 from crowdmap_torch.geometry.rig import camera_in_link
+from crowdmap_torch.io.budget import read_bytes
 from crowdmap_torch.io.documents import Document, read_yaml
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.tables import Rig
@@ -19,6 +21,14 @@ MIN_CLOSING_SHARE = 0.9
 """A lens whose undistortion closes on a smaller share of the image is refused."""
 MAX_SIDE_PX = 32_768
 """No camera's image is wider or higher; more is a slip of the keyboard."""
+MAX_FOCAL_PX = 1e6
+"""No camera of a car sees as narrow an angle, and no image's centre is as far off it."""
+MAX_COEFFICIENT = 1e6
+"""Of distortion: whatever is larger folds the whole image."""
+MIN_HEIGHT_M, MAX_HEIGHT_M = 0.01, 1e4
+"""Of a camera over its road, units that are mistaken included: those are warned of."""
+MAX_MOUNT_M = 100.0
+"""No camera sits further from the link whose pose is known."""
 UNIT_TOLERANCE = 1e-3
 """How far from 1 the length of a unit vector or quaternion may be."""
 
@@ -55,13 +65,13 @@ def _read_camera(section: Document) -> Camera:
     model = section.text("model")
     if model not in MODELS:
         raise section.fault(f"expected one of {', '.join(MODELS)}, found {model!r}", "model")
-    distortion = section.numbers("distortion")
+    distortion = section.numbers("distortion", most=MAX_COEFFICIENT)
     if len(distortion) not in (counts := COEFFICIENT_COUNTS[model]):
         much = ", ".join(map(str, counts))
         rule = f"expected {much} numbers for {model}, found {len(distortion)}"
         raise section.fault(rule, "distortion")
-    fx, fy = section.positive("fx"), section.positive("fy")
-    cx, cy = section.number("cx"), section.number("cy")
+    fx, fy = (section.number(key, low=1.0, high=MAX_FOCAL_PX) for key in ("fx", "fy"))
+    cx, cy = (section.number(key, low=-MAX_FOCAL_PX, high=MAX_FOCAL_PX) for key in ("cx", "cy"))
     camera = Camera(
         model=model,
         width=section.integer("width", low=2, high=MAX_SIDE_PX),
@@ -81,27 +91,30 @@ def _read_camera(section: Document) -> Camera:
 
 def _read_road(section: Document) -> tuple[Float[Tensor, " 3"], float]:
     section.allow(("normal", "height_m"))
-    normal = torch.tensor(section.numbers("normal", 3), dtype=torch.float64)
+    normal = torch.tensor(section.numbers("normal", 3, most=2.0), dtype=torch.float64)
     length = math.hypot(*normal.tolist())
     if abs(length - 1) > UNIT_TOLERANCE:
         raise section.fault(f"expected a unit vector, found one of length {length:.6g}", "normal")
-    return normal / length, section.positive("height_m")
+    return normal / length, section.number("height_m", low=MIN_HEIGHT_M, high=MAX_HEIGHT_M)
 
 
 def _read_mount(section: Document, folder: Path) -> Float[Tensor, "4 4"]:
     section.allow(("urdf", "pose_link", "camera_link"))
-    name = section.text("urdf")
+    name = section.place("urdf")
     path = folder / name
     # Resolved, so that neither `..` nor a link leads out of the rig's folder.
-    if Path(name).is_absolute() or not path.resolve().is_relative_to(folder.resolve()):
+    inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+    if Path(name).is_absolute() or not inside:
         raise section.fault(f"expected a file inside the rig's folder, found {name!r}", "urdf")
-    if not path.is_file():
-        raise section.fault(f"the file {path} is missing", "urdf")
+    content = read_bytes(path)
     try:
-        return camera_in_link(
-            path.read_bytes(), section.text("pose_link"), section.text("camera_link")
-        )
-    except (ValueError, OSError) as error:
+        T = camera_in_link(content, section.text("pose_link"), section.text("camera_link"))
+    except ValueError as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: {one_line(error)}") from error
+    if not float(T[:3, 3].norm()) <= MAX_MOUNT_M:
+        away = f"{float(T[:3, 3].norm()):.4g} m"
+        rule = f"the camera is {away} from the pose link; expected {MAX_MOUNT_M:g} m at most"
+        raise InputError(f"{path}: {rule}")
+    return T

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.columns import Sheet
 from crowdmap_torch.io.datasets import read_origin
 from crowdmap_torch.io.errors import InputError
@@ -19,13 +21,19 @@ from crowdmap_torch.tables import LANE_TYPES, Survey, SurveyLanePoints, SurveySi
 def read_survey(path: Path | str) -> Survey:
     """A survey; either of its two files may be missing. InputError for what breaks FORMAT.md."""
     folder = Path(path)
+    with reading(inside=folder):
+        return _read_survey(folder)
+
+
+def _read_survey(folder: Path) -> Survey:
     head = read_map_head(folder)
     signs_path, lanes_path = folder / "signs.parquet", folder / "lanes.parquet"
-    if not signs_path.exists() and not lanes_path.exists():
+    has_signs, has_lanes = (os.path.lexists(path) for path in (signs_path, lanes_path))
+    if not has_signs and not has_lanes:
         raise InputError(f"{folder}: has neither signs.parquet nor lanes.parquet; expected one")
-    sign_id, signs = _read_signs(signs_path) if signs_path.exists() else ((), _no_signs())
+    sign_id, signs = _read_signs(signs_path) if has_signs else ((), _no_signs())
     lane_id, lane_type, lane_points = (), _integers(), _no_points()
-    if lanes_path.exists():
+    if has_lanes:
         lane_id, lane_type, lane_points = _read_lanes(lanes_path)
     return Survey(
         origin=read_origin(head),

@@ -13,7 +13,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.io.columns import Sheet
+from crowdmap_torch.io.columns import MAX_PLACE_M, Sheet
+from crowdmap_torch.io.datasets import row_count
+from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.rigs import UNIT_TOLERANCE
 from crowdmap_torch.tables import Journey, Rows, Survey
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -94,8 +97,11 @@ def _read_journey_truth(folder: Path, survey: Survey, journey: Journey) -> Journ
     pose = _of_frames(folder / "poses.parquet", _POSE, journey)
     T_world_link = se3.make(se3.from_quaternion(pose[:, 3:]), pose[:, :3]).to(like)
     plane = _of_frames(folder / "road.parquet", ("nx", "ny", "nz", "height_m"), journey).to(like)
-    sign, outlier = _read_labels(folder / "signs.parquet", "sign_id", survey.sign_id)
-    lane, _ = _read_labels(folder / "lanes.parquet", "lane_id", survey.lane_id)
+    _refuse_off(folder / "poses.parquet", "quaternion", pose[:, 3:])
+    _refuse_off(folder / "road.parquet", "normal", plane[:, :3])
+    rows = {kind: row_count(journey, kind) for kind in ("sign", "lane")}
+    sign, outlier = _read_labels(folder / "signs.parquet", "sign_id", survey.sign_id, rows["sign"])
+    lane, _ = _read_labels(folder / "lanes.parquet", "lane_id", survey.lane_id, rows["lane"])
     frame = torch.full((len(sign),), -1, dtype=torch.int64)
     row = journey.signs.row.cpu()
     if len(row) and int(row.max()) >= len(sign):
@@ -119,7 +125,15 @@ def _read_journey_truth(folder: Path, survey: Survey, journey: Journey) -> Journ
 def _of_frames(path: Path, columns: Sequence[str], journey: Journey) -> Float[Tensor, "f k"]:
     """Columns of a file with a row for each frame, in the order of the journey's frames."""
     sheet = Sheet(path, ("frame", *columns))
-    values = torch.from_numpy(np.stack([sheet.numbers(name) for name in columns], axis=-1))
+    numbers = [sheet.numbers(name) for name in columns]
+    for name, of_name in zip(columns, numbers, strict=True):
+        sheet.refuse(
+            np.abs(of_name) > MAX_PLACE_M,
+            lambda row, name=name, found=of_name: (
+                f"column {name!r}: expected {MAX_PLACE_M:g} m at most, found {found[row]}"
+            ),
+        )
+    values = torch.from_numpy(np.stack(numbers, axis=-1))
     frame = torch.from_numpy(sheet.integers("frame"))
     order = frame.argsort()
     wanted = journey.frame_number.cpu()
@@ -129,12 +143,28 @@ def _of_frames(path: Path, columns: Sequence[str], journey: Journey) -> Float[Te
     return values[order[place]]
 
 
+def _refuse_off(path: Path, name: str, vector: Float[Tensor, "f k"]) -> None:
+    """Refuses vectors that should have length one."""
+    off = (vector.norm(dim=-1) - 1).abs().gt(UNIT_TOLERANCE)
+    if bool(off.any()):
+        length = float(vector[off][0].norm())
+        raise InputError(f"{path}: a {name} has length {length:.6g}; expected 1")
+
+
 def _read_labels(
-    path: Path, column: str, ids: Sequence[str]
+    path: Path, column: str, ids: Sequence[str], most: int
 ) -> tuple[Int[Tensor, " r"], Bool[Tensor, " r"]]:
     """For each row of a detection file what it shows (-1 none), and whether it is an outlier."""
     sheet = Sheet(path, ("row", column), ("outlier",))
-    row = torch.from_numpy(sheet.integers("row"))
+    rows_given = sheet.integers("row")
+    sheet.refuse(
+        (rows_given < 0) | (rows_given >= most),
+        lambda at: (
+            f"row {rows_given[at]} of the journey's file, which has {most}. "
+            "Is it another dataset's truth?"
+        ),
+    )
+    row = torch.from_numpy(rows_given)
     names = sheet.strings(column, optional=True)
     label = index_in(names, ids)
     sheet.refuse(
@@ -176,6 +206,8 @@ def read_associations(path: Path, journey_ids: Sequence[str]) -> SignAssociation
     journey = index_in(sheet.strings("journey_id"), journey_ids)
     names = sheet.strings("landmark_id", optional=True)
     landmark = index_in(names, [name for name in names.unique().to_pylist() if name is not None])
-    row = torch.from_numpy(sheet.integers("row"))
+    given = sheet.integers("row")
+    sheet.refuse(given < 0, lambda at: f"column 'row': expected 0 or more, found {given[at]}")
+    row = torch.from_numpy(given)
     is_sign = index_in(sheet.strings("kind"), ("sign",)) == 0
     return SignAssociations(journey, row, landmark)[is_sign & (journey >= 0) & (landmark >= 0)]

@@ -182,7 +182,7 @@ def only(name: str, starts: tuple[str, ...]) -> Callable[[Path], object]:
         (only("pixels.csv", ("img0,w0", "img0,w1", "img0,w2", "img0,w3")), "4 points; expected 6"),
         (only("points.csv", ("w",)), "is not among the surveyed ones"),
         (only("pixels.csv", ("nothing",)), "no rows"),
-        (change("rig-a/rig.yaml", "fx: 1000.0", "fx: -1.0"), "expected a number above 0"),
+        (change("rig-a/rig.yaml", "fx: 1000.0", "fx: -1.0"), "expected a number in 1 to"),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(

@@ -52,7 +52,10 @@ POINT_FAULTS = {
         POINTS.replace("floor", "roof"),
         "row 3: surface: expected one of wall, floor, found",
     ),
-    "number": (POINTS.replace("5.5", "high"), "row 3: y: expected a finite number, found 'high'"),
+    "number": (
+        POINTS.replace("5.5", "high"),
+        "row 3: y: expected a finite number, 1e.06 at most, found 'high'",
+    ),
     "infinite": (POINTS.replace("5.5", "inf"), "row 3: y: expected a finite number"),
     "cell": (
         POINTS.replace("4,5.5", ",5.5"),

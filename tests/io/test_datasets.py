@@ -215,6 +215,20 @@ FAULTS = {
     ),
     "frame falls": (put("poses", "frame", [10, 9, 13, 14]), "row 1: column 'frame': 9 after 10"),
     "time stands": (put("poses", "t_ns", [1, 2, 2, 3]), "row 2: column 't_ns': 2 after 2"),
+    "far away": (
+        put("poses", "x", [0.0, 1.0, 2e6, 3.0]),
+        r"poses.parquet: row 2: the position \(2000000, 0.2, 0\) is over 1,000 km .* UTM",
+    ),
+    "huge": (put("poses", "z", [0.0, 1e300, 0.0, 0.0]), "row 1: the position .* is over 1,000 km"),
+    "teleport": (
+        put("poses", "x", [0.0, 1.0, 5000.0, 5001.0]),
+        "poses.parquet: row 0: from frame 10 to frame 14 the car moves 5001 m in 0.198 s",
+    ),
+    "too fast": (
+        lambda j: j.poses.update(t_ns=[10**9 * k for k in range(4)], x=[0.0, 160.0, 320.0, 480.0]),
+        "poses.parquet: row 0: from frame 10 to frame 11 the car moves 160 m in 1 s",
+    ),
+    "times beyond": (put("poses", "t_ns", [1, 2, 3, 2**62]), "row 3: column 't_ns': .*at most"),
     "sigma below zero": (
         put("poses", "sigma_rot", [0.1, -0.1, 0.1, 0.1]),
         "row 1: column 'sigma_rot': expected 0 or more",

@@ -104,7 +104,7 @@ BAD_VALUES = {
         2,
         "a: expected a number in -inf to 1, found 2.0",
     ),
-    "zero": (lambda d: d.positive("a"), 0, "a: expected a number above 0"),
+    "zero": (lambda d: d.numbers("a", most=1.0), [0, 2], r"a\[1\]: expected a number in -1 to 1"),
     "short": (
         lambda d: d.numbers("a", 3),
         [1, 2],

@@ -91,8 +91,8 @@ FAULTS = {
     "width huge": (camera(width=10**9), "camera.width: expected a whole number in 2 to 32768"),
     "width true": (camera(width=True), "camera.width: expected a whole number"),
     "height zero": (camera(height=0), "camera.height: expected a whole number"),
-    "fx negative": (camera(fx=-100.0), "camera.fx: expected a number above 0"),
-    "fy zero": (camera(fy=0), "camera.fy: expected a number above 0"),
+    "fx negative": (camera(fx=-100.0), "camera.fx: expected a number in 1 to 1e\\+06"),
+    "fy zero": (camera(fy=0), "camera.fy: expected a number in 1 to"),
     "fx a text": (camera(fx="wide"), "camera.fx: expected a number, found 'wide'"),
     "cx NaN": (camera(cx=float("nan")), "camera.cx: expected a finite number"),
     "cy infinite": (camera(cy=float("inf")), "camera.cy: expected a finite number"),
@@ -115,9 +115,9 @@ FAULTS = {
     ),
     "normal length": (road(normal=[0, 1.002, 0]), "road.normal: expected a unit vector, found one"),
     "normal short": (road(normal=[0, 1]), "road.normal: expected a list of 3 numbers, found 2 val"),
-    "height_m": (road(height_m=-1.45), "road.height_m: expected a number above 0"),
+    "height_m": (road(height_m=-1.45), "road.height_m: expected a number in 0.01 to"),
     "mount no mapping": (lambda t: t.rigs["a"].update(mount="rig.urdf"), "mount: expected a mapp"),
-    "urdf missing": (mount(urdf="other.urdf"), "mount.urdf: the file .*other.urdf is missing"),
+    "urdf missing": (mount(urdf="other.urdf"), "other.urdf: the file is missing"),
     "urdf outside": (
         mount(urdf="../b/rig.urdf"),
         "mount.urdf: expected a file inside the rig's fol",
@@ -152,7 +152,7 @@ def test_a_link_out_of_the_rigs_folder_is_not_followed(sound) -> None:
 def test_a_rig_that_is_not_text_is_refused(sound) -> None:
     folder = sound.write() / "rigs" / "a"
     (folder / "rig.yaml").write_bytes(b"camera: \xff\xfe")
-    with pytest.raises(InputError, match=r"rig\.yaml: cannot be read as YAML"):
+    with pytest.raises(InputError, match=r"rig\.yaml: is no UTF-8 text"):
         read_rig(folder)
 
 

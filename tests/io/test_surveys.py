@@ -124,7 +124,7 @@ SURVEY_FAULTS = {
     "centre of two": (sign(center=[[1.0, 2.0]]), "row 0: column 'center': expected 3 numbers"),
     "normal length": (sign(normal=[[-2.0, 0.0, 0.0]]), "row 0: column 'normal': expected a unit"),
     "anticlockwise": (sign(normal=[[1.0, 0.0, 0.0]]), "row 0: corners run anticlockwise"),
-    "sigma": (sign(sigma_m=[0.0]), "row 0: column 'sigma_m': expected a number above 0"),
+    "sigma": (sign(sigma_m=[0.0]), "row 0: column 'sigma_m': expected 1e-06 to"),
 }
 
 

@@ -121,9 +121,12 @@ def _degrees(p: np.ndarray, origin: dict) -> np.ndarray:
     return np.stack((lat, lon, p[:, 2] + origin["height_m"]), -1)
 
 
-def _utm(p: np.ndarray, origin: dict) -> np.ndarray:
-    """The simulator's origin is there in zone 11."""
-    return p + np.array([481_290.0, 3_640_280.0, 0.0])
+def _utm(folder: Path) -> None:
+    """The simulator's origin, moved to 5 degrees north, is there in zone 11; further north it is over 1,000 km."""
+    head = json.loads((folder / "dataset.json").read_text())
+    head["origin"] |= {"lat_deg": 5.0, "lon_deg": -117.2}
+    (folder / "dataset.json").write_text(json.dumps(head))
+    _moved(lambda p, origin: p + np.array([477_830.0, 552_680.0, 0.0]))(folder)
 
 
 def _pixels(change: Callable[[np.ndarray, np.ndarray, dict], tuple], *, lanes: bool = True):
@@ -235,7 +238,7 @@ MISTAKES: dict[str, Callable[[Path], None]] = {
     ),
     "north-east-down": _poses(lambda R, p: (_NED @ R, p @ _NED.T)),
     "degrees": _moved(_degrees),
-    "utm": _moved(_utm),
+    "utm": _utm,
     "absolute-heights": _moved(lambda p, o: p + np.array([0.0, 0.0, o["height_m"]])),
     "swapped-pixels": _pixels(lambda u, v, camera: (v, u)),
     "unit-pixels": _pixels(lambda u, v, c: (u / c["width"], v / c["height"])),
