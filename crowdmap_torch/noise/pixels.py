@@ -99,10 +99,17 @@ def noise_by_box(length: Float[Tensor, " m"], box_px: Float[Tensor, " m"]) -> Bo
     variance = torch.stack([length[part].median().square() for part in parts])
     inverse = torch.stack([box_px[part].median() for part in parts]).pow(-2)
     # A relative error of the variance is about the same in every class.
-    A = torch.stack((torch.ones_like(inverse), inverse), dim=1) / variance[:, None].clamp_min(1e-12)
-    whole = torch.stack((variance.mean(), torch.zeros_like(variance[0])))
-    fit = torch.linalg.lstsq(A, torch.ones_like(variance)).solution if len(parts) > 1 else whole
-    large, small = torch.where((fit > 0).all(), fit, whole)
+    of_large = variance.clamp_min(1e-12).reciprocal()
+    of_small = inverse * of_large
+    # In closed form: LAPACK's least squares differ in the last bit from call to call.
+    share = (of_small * of_large).sum() / of_large.square().sum()
+    beside = of_small - share * of_large
+    told_apart = beside.square().sum() > 1e-9 * of_small.square().sum()
+    small = beside.sum() / beside.square().sum().clamp_min(1e-300)
+    large = of_large.sum() / of_large.square().sum() - share * small
+    both = told_apart & (large > 0) & (small > 0)
+    large = torch.where(both, large, variance.mean())
+    small = torch.where(both, small, 0.0)
     return BoxNoise(large.sqrt(), (small / large.clamp_min(1e-12)).sqrt())
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from crowdmap_torch.noise.pixels import (
+    _CLASSES,
     DetectionNoise,
     PixelNoiseConfig,
     box_scales,
@@ -115,3 +116,16 @@ def test_a_detection_moved_as_a_whole_is_its_poses_error():
     # The prior's share is small beside what sixteen pixels say.
     assert float(found[0, 0]) == pytest.approx(-0.2, rel=0.05)
     assert found[0, 1:].count_nonzero() == 0
+
+
+def test_noise_by_box_is_the_least_squares_of_the_classes(generator):
+    box = 10 + 90 * torch.rand(4000, dtype=torch.float64, generator=generator)
+    length = lengths(box, 0.55, 12.0, generator)
+    classes = torch.argsort(box, stable=True).tensor_split(_CLASSES)
+    variance = torch.stack([length[c].median().square() for c in classes])
+    inverse = torch.stack([box[c].median() for c in classes]).pow(-2)
+    A = torch.stack((torch.ones_like(inverse), inverse), dim=1) / variance[:, None]
+    large, small = torch.linalg.lstsq(A, torch.ones_like(variance)).solution
+    found = noise_by_box(length, box)
+    assert float(found.large_px) == pytest.approx(float(large.sqrt()), rel=1e-9)
+    assert float(found.small_box_px) == pytest.approx(float((small / large).sqrt()), rel=1e-9)
