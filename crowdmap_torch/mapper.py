@@ -7,11 +7,8 @@ does it all; `commands/optimize.py` spells out the same calls with logging betwe
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 
 import torch
 from jaxtyping import Float
@@ -38,6 +35,7 @@ from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.maps import as_map
 from crowdmap_torch.lanes.reconstruct import LaneReport, reconstruct_lanes
 from crowdmap_torch.optim.levenberg_marquardt import LmState
+from crowdmap_torch.processes.workers import Workers
 from crowdmap_torch.road.estimate import estimate_road
 from crowdmap_torch.signs.triangulate import SignReport, triangulate_signs
 from crowdmap_torch.survey.control import find_control_signs
@@ -145,27 +143,25 @@ def map_journeys(
     workers: int = 1,
     progress: ProgressCall = silent,
 ) -> tuple[JourneyMap, ...]:
-    """Section IV for every journey, `workers` at a time, each on one core; the result does not depend on how many."""
+    """Section IV for every journey, `workers` at a time, each on one core; the result does not depend on how many.
+
+    ChildProcessError, with the journey's name, if the process of a journey is killed.
+    """
     stage, total = "single journeys", len(journeys)
     progress(stage, 0, total)
-    maps = []
     if workers <= 1 or total <= 1 or journeys[0].t_ns.is_cuda:
+        maps = []
         for number, journey in enumerate(journeys):
             maps.append(map_journey(journey, number, config))
             progress(stage, number + 1, total)
         return tuple(maps)
-    # Pickled by hand: torch would hand every tensor over as an open file, and a fleet has thousands.
-    tasks = (pickle.dumps((j, number, config)) for number, j in enumerate(journeys))
-    with ProcessPoolExecutor(
-        min(workers, total),
-        mp_context=get_context("spawn"),
-        initializer=torch.set_num_threads,
-        initargs=(1,),
-    ) as pool:
-        for number, made in enumerate(pool.map(_map_pickled, tasks)):
-            maps.append(pickle.loads(made))
-            progress(stage, number + 1, total)
-    return tuple(maps)
+    calls = ((j.journey_id, map_journey, (j, number, config)) for number, j in enumerate(journeys))
+    made: dict[int, JourneyMap] = {}
+    with Workers(min(workers, total), torch.set_num_threads, 1) as pool:
+        for number, journey_map in pool.each(calls):
+            made[number] = journey_map
+            progress(stage, len(made), total)
+    return tuple(made[number] for number in range(total))
 
 
 @torch.no_grad()
@@ -304,7 +300,3 @@ def clusters_map(dataset: Dataset, first: FirstMap, provenance: dict | None = No
     lanes, associations = first.lanes, first.associations
     provenance = {} if provenance is None else provenance
     return as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
-
-
-def _map_pickled(task: bytes) -> bytes:
-    return pickle.dumps(map_journey(*pickle.loads(task)))

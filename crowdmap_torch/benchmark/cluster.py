@@ -13,9 +13,7 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -29,6 +27,7 @@ from crowdmap_torch.crowd_signs.gather import CrowdSigns
 from crowdmap_torch.crowd_signs.register import CrowdConfig, register_crowd
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.processes.workers import Workers
 from crowdmap_torch.tables import Signs
 
 THREADS = 2
@@ -227,8 +226,9 @@ def _in_fresh_process(method: str, triangulations: int, seed: int) -> Measured:
     # Read when the libraries are loaded, that is, by the child.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = str(THREADS)
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(measure, method, triangulations, seed).result()
+    with Workers(1, torch.set_num_threads, THREADS) as pool:
+        pool.start(method, (method, measure, (method, triangulations, seed)))
+        return pool.wait()[0][1]
 
 
 def _pairs(group: Int[Tensor, " n"]) -> int:

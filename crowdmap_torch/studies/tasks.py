@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
 from pathlib import Path
-from signal import SIG_DFL, SIGINT, signal
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -20,6 +17,7 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.mapper import JourneyMap, build_map, map_journey
+from crowdmap_torch.processes.workers import Workers
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.simulate.dataset import SimulationConfig, write_dataset
 from crowdmap_torch.studies.folder import StudyFolder, dataset_name, digest, journey_config_hash
@@ -287,30 +285,17 @@ def run_tasks(
             tell(task)
         progress.finish()
         return
-    with ProcessPoolExecutor(
-        processes, mp_context=get_context("spawn"), initializer=_begin_worker
-    ) as pool:
-        running: dict[Future[None], Task] = {}
-        try:
-            while waiting or running:
-                unfinished = waiting.keys() | {task.key for task in running.values()}
-                ready = [key for key in waiting if not needs[key] & unfinished]
-                for key in ready[: processes - len(running)]:
-                    task = waiting.pop(key)
-                    running[pool.submit(task.run, folder)] = task
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    task = running.pop(future)
-                    future.result()
-                    tell(task)
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    running: dict[str, Task] = {}
+    with Workers(processes, torch.set_num_threads, 1) as pool:
+        while waiting or running:
+            unfinished = waiting.keys() | running.keys()
+            ready = [key for key in waiting if not needs[key] & unfinished]
+            for key in ready[: pool.free]:
+                running[key] = waiting.pop(key)
+                pool.start(key, (key, running[key].run, (folder,)))
+            for key, _ in pool.wait():
+                tell(running.pop(key))
     progress.finish()
-
-
-def _begin_worker() -> None:
-    # Ctrl-C ends a worker at once; files are written beside their place and renamed.
-    signal(SIGINT, SIG_DFL)
-    torch.set_num_threads(1)
 
 
 def _numbered(made: JourneyMap, number: int) -> JourneyMap:

@@ -1,0 +1,1 @@
+"""The process and its like: workers that die with it, signals that end it, streams that nobody reads."""
