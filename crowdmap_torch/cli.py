@@ -1,6 +1,8 @@
 """The command line: `crowdmap NAME [options]`, or `python -m crowdmap_torch NAME [options]`.
 
-Exit codes: 0 done; 2 the input or the configuration is wrong, said in one line; 1 anything else.
+Exit codes: 0 done; 2 the input or the configuration is wrong; 1 anything else, such as a disk that is full; 130, 143 and
+129 ended by SIGINT, SIGTERM and SIGHUP; 141 done, but nobody read standard output to its end. Each but 0 and 141 is said in
+one line.
 """
 
 from __future__ import annotations
@@ -11,7 +13,9 @@ from collections.abc import Sequence
 
 from crowdmap_torch import __version__
 from crowdmap_torch.commands.subcommands import add_subcommands
-from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.processes.interrupts import Interruptible, kept
+from crowdmap_torch.processes.streams import StandardStreams
 
 COMMANDS = {
     "optimize": "map a dataset",
@@ -23,6 +27,10 @@ COMMANDS = {
 }
 
 
+_OUTPUT_UNREAD = 128 + 13
+"""As a shell sees a program that SIGPIPE ended."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Reads the command line, runs the subcommand, and returns the exit code."""
     parser = argparse.ArgumentParser(
@@ -30,10 +38,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     add_subcommands(parser, "crowdmap_torch.commands", COMMANDS)
-    options = parser.parse_args(arguments)
-    try:
-        options.module.run(options)
-    except InputError as error:
-        sys.stderr.write(f"{options.prog}: {error}\n")
-        return 2
-    return 0
+    options = argparse.Namespace(prog="crowdmap")
+
+    def say(text: str) -> None:
+        # Progress may have left its line open on a terminal.
+        begin = "\r\x1b[K" if sys.stderr.isatty() else ""
+        sys.stderr.write(f"{begin}{options.prog}: {text}\n")
+        sys.stderr.flush()
+
+    code = 0
+    with (
+        StandardStreams() as streams,
+        Interruptible(lambda name: say(f"ended by {name}; {kept()}")) as signals,
+    ):
+        try:
+            parser.parse_args(arguments, options)
+            options.module.run(options)
+        except InputError as error:
+            say(str(error))
+            code = 2
+        except OSError as error:
+            say(f"{_reason(error)}; {kept()}")
+            code = 1
+        fault = streams.output_fault()
+        if isinstance(fault, BrokenPipeError):
+            code = code or _OUTPUT_UNREAD
+        elif fault is not None:
+            say(f"standard output: {_reason(fault)}")
+            code = code or 1
+    return 128 + signals.number if signals.number else code
+
+
+def _reason(error: OSError) -> str:
+    if error.strerror is None:
+        return one_line(error)
+    place = "" if error.filename is None else f"{error.filename}: "
+    return one_line(f"{place}{error.strerror}")

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from worlds.programs import PATIENCE_S, begin
 
 from crowdmap_torch import __version__, benchmark, studies
 from crowdmap_torch.cli import COMMANDS, main
@@ -112,3 +113,73 @@ def test_every_module_that_can_be_run_is_listed(package, names: dict[str, str]):
     }
     runnable = {name for name, module in modules.items() if hasattr(module, "run")}
     assert runnable == {name.replace("-", "_") for name in names}
+
+
+def test_a_full_disk_is_one_line_and_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def write(options: object) -> None:
+        raise OSError(28, "No space left on device", "some/map")
+
+    monkeypatch.setattr("crowdmap_torch.benchmark.cluster.run", write)
+    assert main(["benchmark", "cluster"]) == 1
+    error = capsys.readouterr().err
+    assert error == (
+        "crowdmap benchmark cluster: some/map: No space left on device; nothing half-written is left\n"
+    )
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+@pytest.mark.parametrize(
+    ("redirection", "code", "said"),
+    [
+        (">/dev/full", 1, "crowdmap calibrate: standard output: No space left on device\n"),
+        (">&-", 0, ""),
+        ("| true", 141, ""),
+    ],
+)
+def test_work_is_done_though_nobody_can_read_what_is_printed(
+    redirection: str, code: int, said: str, tmp_path: Path
+):
+    done = tmp_path / "done"
+    program = (
+        "import pathlib, sys, time, types\n"
+        "from crowdmap_torch.cli import main\n"
+        "chosen = sys.modules['crowdmap_torch.commands.calibrate'] = types.ModuleType('calibrate')\n"
+        "chosen.add_arguments = lambda parser: None\n"
+        "def run(options):\n"
+        "    time.sleep(0.2)\n"
+        "    print('figures')\n"
+        f"    pathlib.Path({str(done)!r}).touch()\n"
+        "chosen.run = run\n"
+        "sys.exit(main(['calibrate']))\n"
+    )
+    ended = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", f'"$0" -c "$1" {redirection}', sys.executable, program],
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (code, said) and done.exists()
+
+
+def test_a_signal_is_one_line_and_nothing_half_written_stays(tmp_path: Path):
+    out = tmp_path / "dataset"
+    program = (
+        "import sys, crowdmap_torch.simulate.dataset as simulated\n"
+        "from crowdmap_torch.cli import main\n"
+        "write = simulated.files.write_truth\n"
+        "def say(*arguments):\n"
+        "    write(*arguments)\n"
+        "    print('written', flush=True)\n"
+        "simulated.files.write_truth = say\n"
+        f"sys.exit(main(['simulate', {str(out)!r}, '--world', 'street', '--journeys', '400']))\n"
+    )
+    ended = begin("-c", program)
+    assert ended.stdout is not None and ended.stdout.readline() == "written\n"
+    ended.terminate()
+    _, said = ended.communicate(timeout=PATIENCE_S)
+    assert ended.returncode == 143
+    assert said == "crowdmap simulate: ended by SIGTERM; nothing half-written is left\n"
+    assert list(tmp_path.iterdir()) == []

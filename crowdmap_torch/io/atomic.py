@@ -9,17 +9,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from crowdmap_torch.processes.interrupts import held
+
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """A path to write to; it becomes `path` if the block ends well and disappears if not."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """A path to write to; it becomes `path` if the block ends well and disappears if not.
+
+    OSError, with `path`, if the block or the renaming fails.
+    """
     beside = _beside(path, "part")
     try:
-        yield beside
-        os.replace(beside, path)
+        with _named(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield beside
+            os.replace(beside, path)
     finally:
-        beside.unlink(missing_ok=True)
+        with held():
+            beside.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -27,16 +34,33 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """An empty folder to write to; it becomes `path` if the block ends well and disappears if not.
 
     What was at `path` before stays untouched until the block has ended, and is put back should the
-    renaming fail.
+    renaming fail. OSError, with a path, if the block or the renaming fails.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     beside = _beside(path, "part")
-    beside.mkdir()
     try:
-        yield beside
-        _replace_folder(beside, path)
+        with _named(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            beside.mkdir()
+            yield beside
+            with held():
+                _replace_folder(beside, path)
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        with held():
+            shutil.rmtree(beside, ignore_errors=True)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Inside, an OSError that does not say which file it is about is about `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        # A disk that is full says so without a name; Arrow wraps it into a longer text.
+        if error.errno is None:
+            raise OSError(f"{path}: {error}") from error
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
 
 
 def _replace_folder(new: Path, path: Path) -> None:

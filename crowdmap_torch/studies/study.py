@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from crowdmap_torch.processes.interrupts import keeping
 from crowdmap_torch.studies.chapter import Chapter, Table, write_chapters
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.numbers import seconds
 from crowdmap_torch.studies.scale import FULL, QUICK, Scale
 from crowdmap_torch.studies.tasks import Task, finished_keys, open_tasks, run_tasks
 
-INTERRUPTED = "stopped; what is done is kept, and the same command goes on from there"
+STOPPED = "what is done is kept: the same command goes on from there, --report-only draws it"
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,8 @@ def run_studies(name: str, studies: Sequence[Study], options: argparse.Namespace
     turns = [turn for study in studies for turn in study.tasks(settings)]
     tasks = [task for _, task in sorted(turns, key=lambda turn: turn[0])]
     if not options.report_only:
-        try:
+        with keeping(lambda: STOPPED):
             run_tasks(tasks, folder, processes=options.processes)
-        except KeyboardInterrupt:
-            sys.stderr.write(f"\n{INTERRUPTED}\n")
     chapters = [(study.name, study.title, study.chapter(settings, folder)) for study in studies]
     chapters.append(("times", "Times", time_chapter(studies, settings, folder)))
     title = studies[0].title if len(studies) == 1 else "Studies"

@@ -91,3 +91,11 @@ def test_a_link_is_replaced_and_what_it_names_is_left_alone(tmp_path: Path) -> N
         (beside / "file").write_text("new")
     assert (link / "file").read_text() == "new"
     assert (kept / "file").read_text() == "kept"
+
+
+@pytest.mark.parametrize("atomic", [atomic_file, atomic_folder])
+def test_a_full_disk_names_the_file_that_it_was_written_to(tmp_path: Path, atomic) -> None:
+    path = tmp_path / "map"
+    with pytest.raises(OSError, match=r"No space left on device: '.*/map'$"), atomic(path):
+        raise OSError(28, "No space left on device")
+    assert list(tmp_path.iterdir()) == []
