@@ -1,8 +1,8 @@
 """The command line: `crowdmap NAME [options]`, or `python -m crowdmap_torch NAME [options]`.
 
-Exit codes: 0 done; 2 the input or the configuration is wrong; 1 anything else, such as a disk that is full; 130, 143 and
-129 ended by SIGINT, SIGTERM and SIGHUP; 141 done, but nobody read standard output to its end. Each but 0 and 141 is said in
-one line.
+Exit codes: 0 done; 2 the input or the configuration is wrong; 3 the map has no signs or no lanes though some were detected
+(`optimize --strict`); 1 anything else, such as a disk that is full; 130, 143 and 129 ended by SIGINT, SIGTERM and SIGHUP;
+141 done, but nobody read standard output to its end. Each but 0 and 141 is said in one line.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ):
         try:
             parser.parse_args(arguments, options)
-            options.module.run(options)
+            code = options.module.run(options) or 0
         except InputError as error:
             say(str(error))
             code = 2

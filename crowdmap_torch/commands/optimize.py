@@ -27,7 +27,9 @@ from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.errors import input_read
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.plausibility.dataset import look_over
+from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.report.checkpoints import load_checkpoint, save_checkpoint
+from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.record import record_of
@@ -43,6 +45,9 @@ from crowdmap_torch.runs.folder import (
 )
 from crowdmap_torch.runs.metrics import metrics_of
 from crowdmap_torch.tables import Dataset, RejectedJourney
+
+EMPTY_MAP = 3
+"""Exit code with `--strict` where a map was written without the signs or lanes that were detected."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="journeys mapped at a time (default: one for each core)",
     )
-    parser.add_argument("--strict", action="store_true", help="a bad journey is an error")
+    parser.add_argument(
+        "--strict", action="store_true", help="a bad journey or an empty map is an error"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace what RUN holds")
     parser.add_argument("--resume", action="store_true", help="go on where RUN was interrupted")
     parser.add_argument(
@@ -69,8 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> None:
-    """Maps `options.dataset` into the folder `options.out`."""
+def run(options: argparse.Namespace) -> int:
+    """Maps `options.dataset` into the folder `options.out`; the exit code."""
     with input_read():
         refuse_overlap(options.out, options.dataset)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
@@ -83,8 +90,7 @@ def run(options: argparse.Namespace) -> None:
         if options.control is not None:
             control = read_survey_at(options.control, dataset.origin)
     findings = look_over(options.dataset, dataset, config.positioning, config.sign_association)
-    for finding in findings:
-        print(f"looks wrong: {finding.line(len(dataset.journeys))}", file=sys.stderr)
+    _tell(findings, dataset)
 
     progress = Progress()
     folder.prepare()
@@ -137,12 +143,16 @@ def run(options: argparse.Namespace) -> None:
         print(format_figures(figures))
     progress.finish()
     seconds, compared = progress.seconds, (figures, figures_before)
+    missing = missing_findings(dataset, result, config)
+    _tell(missing, dataset)
+    warnings = (*findings, *missing)
     metrics = metrics_of(dataset, result, config, watch.iterations, seconds, *compared)
-    folder.write_metrics({**metrics, "warnings": plain(findings)})
-    record = record_of(dataset, result, config, watch, seconds, survey, truth, *compared)
+    folder.write_metrics({**metrics, "warnings": plain(warnings)})
+    record = record_of(dataset, result, config, watch, seconds, survey, truth, *compared, warnings)
     write_report(folder.report, record)
     print(f"map: {folder.map}")
     print(f"report: {folder.report}")
+    return EMPTY_MAP if options.strict and missing else 0
 
 
 def _load(folder: Path, device: torch.device, *, strict: bool) -> Dataset:
@@ -159,6 +169,11 @@ def _load(folder: Path, device: torch.device, *, strict: bool) -> Dataset:
 def _tell_rejected(rejected: Sequence[RejectedJourney]) -> None:
     for journey in rejected:
         print(f"set aside {journey.journey_id}: {journey.reason}", file=sys.stderr)
+
+
+def _tell(findings: Sequence[Finding], dataset: Dataset) -> None:
+    for finding in findings:
+        print(f"looks wrong: {finding.line(len(dataset.journeys))}", file=sys.stderr)
 
 
 def _device(name: str) -> torch.device:

@@ -26,11 +26,15 @@ class Finding:
 
     def line(self, total: int) -> str:
         """One line for a person; `total` journeys were looked at."""
+        return f"{self.seen(total)}: {self.cause}; {self.cure}"
+
+    def seen(self, total: int) -> str:
+        """What was seen, and in which of the `total` journeys."""
         named = ", ".join(self.journeys[:_NAMED])
         if len(self.journeys) > _NAMED:
             named += f" and {len(self.journeys) - _NAMED} more"
         where = f" ({len(self.journeys)} of {total} journeys: {named})" if self.journeys else ""
-        return f"{self.evidence}{where}: {self.cause}; {self.cure}"
+        return self.evidence + where
 
 
 def gathered(found: Sequence[tuple[str, Finding]]) -> tuple[Finding, ...]:

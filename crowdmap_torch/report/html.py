@@ -56,6 +56,7 @@ def page_html(title: str, subtitle: str, sections: Sequence[tuple[str, str, str]
 
 def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
     """Anchor, title and content of each section; those without content are left out."""
+    yield "warnings", "Looks wrong", _warnings(record)
     yield "headline", "At a glance", headline_cards(record)
     told = note("From above. A click on a row of the table of signs brings it here.")
     yield "map", "Map", told + map_svg(record)
@@ -68,6 +69,14 @@ def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
     yield "pruned", "Left out", _pruned(record)
     yield "timings", "Timings", timing_table(record.timings_s)
     yield "config", "Configuration", _config(record)
+
+
+def _warnings(record: RunRecord) -> str:
+    if not record.warnings:
+        return ""
+    rows = [(w.seen(len(record.journeys)), w.cause, w.cure) for w in record.warnings]
+    head = ("what was seen", "likely cause", "cure")
+    return '<div class="box warn">' + simple_table(head, rows) + "</div>"
 
 
 def _errors(record: RunRecord) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from crowdmap_torch.evaluation.signs import SignComparison
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.plots import Eigengap
 from crowdmap_torch.report.summaries import (
@@ -50,6 +51,8 @@ class RunRecord:
     counts: Mapping[str, float | str] = field(default_factory=dict)
     """Stages' counts by name, in the order of the stages."""
     pruned: tuple[Pruned, ...] = ()
+    warnings: tuple[Finding, ...] = ()
+    """What looked wrong, before mapping and after."""
     rejected: tuple[RejectedJourney, ...] = ()
     """Journeys set aside at the door."""
     outlier_journeys: tuple[RejectedJourney, ...] = ()
@@ -85,6 +88,7 @@ def record_of(
     truth: Truth | None,
     figures: MapFigures | None,
     figures_before: MapFigures | None,
+    warnings: Sequence[Finding] = (),
 ) -> RunRecord:
     """What report.html is drawn from."""
     hd_map, before = (
@@ -103,7 +107,8 @@ def record_of(
         },
         journeys=journey_summaries(dataset, result, truth),
         counts=counts_of(dataset, result, config),
-        pruned=pruned_of(dataset, result),
+        pruned=pruned_of(dataset, result, config),
+        warnings=tuple(warnings),
         rejected=dataset.rejected,
         outlier_journeys=outlier_journeys_of(dataset, result),
         spectra=tuple(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.report.fates import MAPPED, lane_fates, sign_fates
 from crowdmap_torch.tables import Dataset, RejectedJourney
 
 
@@ -79,8 +80,8 @@ def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict
     }
 
 
-def pruned_of(dataset: Dataset, result: MapResult) -> tuple[Pruned, ...]:
-    """What was left out, by stage and reason."""
+def pruned_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> tuple[Pruned, ...]:
+    """What was left out, by stage and reason; last all detections that are not in the map."""
     totals: Counter[tuple[str, str]] = Counter()
     for journey, made in zip(dataset.journeys, result.journey_maps, strict=True):
         for reason, count in journey.dropped.items():
@@ -92,6 +93,11 @@ def pruned_of(dataset: Dataset, result: MapResult) -> tuple[Pruned, ...]:
             if reason != "kept":
                 totals["lane tracklets", reason] += count
     totals["signs of single journeys", "seen by too few journeys"] = len(result.first.tentative)
+    for stage, fates in (
+        ("sign detections", sign_fates(dataset, result, config)),
+        ("lane detections", lane_fates(dataset, result)),
+    ):
+        totals.update({(stage, why): count for why, count in fates.items() if why != MAPPED})
     return tuple(Pruned(stage, why, count) for (stage, why), count in totals.items() if count)
 
 

@@ -34,7 +34,7 @@ def metrics_of(
     summaries = journey_summaries(dataset, result)
     return {
         "counts": counts_of(dataset, result, config),
-        "pruned": plain(pruned_of(dataset, result)),
+        "pruned": plain(pruned_of(dataset, result, config)),
         "times_s": dict(seconds),
         "costs": [
             {"iteration": i.number, "accepted": i.accepted, "total": i.total, **i.cost}

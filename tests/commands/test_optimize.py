@@ -424,7 +424,11 @@ def test_journeys_without_detections_give_a_map_without_rows(optimize, copy: Pat
             path = journey / f"{name}.parquet"
             pq.write_table(pq.read_table(path).slice(0, 0), path)
     out = tmp_path / "run"
-    assert optimize(copy, out).code == 0
+    said = optimize(copy, out, "--strict")
+    assert said.code == 3 and "looks wrong: the map is empty: not one sign or lane" in said.err
+    (warning,) = json.loads((out / "metrics.json").read_text())["warnings"]
+    assert warning["kind"] == "no-detections"
+    assert "not one sign or lane marker was detected" in (out / "report.html").read_text()
     for name in ("map", "map_clusters"):
         assert columns(out / name / "signs.parquet") >= SIGN
         assert columns(out / name / "lanes.parquet") >= LANE

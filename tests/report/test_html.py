@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.report.html import report_html, write_report
 from crowdmap_torch.report.record import RunRecord
 from crowdmap_torch.report.tables_html import sign_table
@@ -62,6 +63,19 @@ def test_every_section_is_there_and_linked(text: str):
     sections += ["signs", "pruned", "timings", "config"]
     assert parsed.links[: len(sections)] == sections
     assert set(sections) <= set(parsed.ids)
+
+
+def test_what_looked_wrong_stands_first(record: RunRecord):
+    found = Finding("axes", "the <camera> looks aside", "poses do not fit", "turn them", ("a", "b"))
+    text = report_html(replace(record, warnings=(found,)))
+    assert parse(text).links[0] == "warnings"
+    told = text[text.index('id="warnings"') : text.index('id="headline"')]
+    for words in ("the &lt;camera&gt; looks aside", "a, b", "poses do not fit", "turn them"):
+        assert words in told
+
+
+def test_nothing_wrong_needs_no_section(text: str):
+    assert 'id="warnings"' not in text
 
 
 def test_the_report_needs_no_network(text: str):

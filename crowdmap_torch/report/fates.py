@@ -1,0 +1,160 @@
+"""Where each detection of a run ended: in the map, or at what it failed; and what to say of a map without rows."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.io.detections import DROPPED_LANE, DROPPED_SIGN
+from crowdmap_torch.lanes import reconstruct
+from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.plausibility.finding import Finding
+from crowdmap_torch.signs import triangulate
+from crowdmap_torch.tables import Dataset
+
+MAPPED = "in the map"
+NO_TRACK = "in no track"
+OUTLIER_JOURNEY = "in a journey that does not fit the others"
+TOO_FEW_JOURNEYS = "in a landmark of too few journeys"
+IMPROBABLE = "in a sign that too many journeys passed by unseen"
+_TRACK = "in a track: "
+
+_WHY: dict[str, tuple[str, str]] = {
+    NO_TRACK: (
+        "what is detected in one frame is not found in the next",
+        "check that detections carry the number of the frame that they were made in",
+    ),
+    _TRACK + "too few frames": (
+        "what is detected in one frame is hardly found again in the next",
+        "check that detections carry their frames' numbers, or record more frames a second",
+    ),
+    _TRACK + "too little parallax": (
+        "the cars hardly move past what they see",
+        "add drives that go by",
+    ),
+    _TRACK + "too far away": (
+        "nothing is seen from near",
+        "check the focal length, and that drives go by what they see",
+    ),
+    _TRACK + "behind the camera": (
+        "poses and detections do not belong together",
+        "check the axes of poses and mount",
+    ),
+    _TRACK + "residual too large": (
+        "rays to one sign do not meet",
+        "check poses, lens, pixels and frame numbers",
+    ),
+    _TRACK + "implausible size": (
+        "what is mapped would be far too small or too large",
+        "check the focal length and that positions are in metres",
+    ),
+    _TRACK + "no points near enough": (
+        "lane points do not lie on the road before the car",
+        "check the rig's road normal and height",
+    ),
+    OUTLIER_JOURNEY: ("journeys contradict each other", "see suspect_journeys in metrics.json"),
+    TOO_FEW_JOURNEYS: ("journeys do not see the same things", "add journeys over the same roads"),
+    IMPROBABLE: (
+        "most journeys that passed saw nothing there",
+        "see tentative_signs.parquet, or lower min_confidence",
+    ),
+}
+"""Likely cause and cure, by the fate of most detections."""
+_UNKNOWN = ("detections were left out", "see `pruned` in metrics.json")
+
+
+def sign_fates(dataset: Dataset, result: MapResult, config: MapperConfig) -> Counter[str]:
+    """Where the sign detections of all files ended; the counts add up to their rows."""
+    is_certain = result.hd_map.signs.confidence >= config.min_confidence
+    outliers = {found.journey for found in result.first.crowd.report.outlier_journeys}
+    total = _dropped(dataset, DROPPED_SIGN)
+    for number, (made, found) in enumerate(
+        zip(result.journey_maps, result.associations, strict=True)
+    ):
+        total += _fates(
+            *(made.sign_tracklets.label, made.sign_report.reason, triangulate.REASONS),
+            *(found.sign, is_certain, number in outliers),
+        )
+    return total
+
+
+def lane_fates(dataset: Dataset, result: MapResult) -> Counter[str]:
+    """The same of lane detections."""
+    every = torch.ones(len(result.hd_map.lanes), dtype=torch.bool)
+    outliers = {found.journey for found in result.first.crowd.report.outlier_journeys}
+    total = _dropped(dataset, DROPPED_LANE)
+    for number, (made, found) in enumerate(
+        zip(result.journey_maps, result.associations, strict=True)
+    ):
+        total += _fates(
+            *(made.lane_tracklets.label, made.lane_report.reason, reconstruct.REASONS),
+            *(found.lane, every.to(found.lane.device), number in outliers),
+        )
+    return total
+
+
+def missing_findings(
+    dataset: Dataset, result: MapResult, config: MapperConfig
+) -> tuple[Finding, ...]:
+    """Why a map has no signs or no lanes although some were detected; and that nothing at all was."""
+    fates = {"sign": sign_fates(dataset, result, config), "lane": lane_fates(dataset, result)}
+    if not any(sum(count.values()) for count in fates.values()):
+        return (
+            Finding(
+                "no-detections",
+                "the map is empty: not one sign or lane marker was detected",
+                "signs.parquet and lanes.parquet of all journeys have no rows",
+                "check what writes them",
+            ),
+        )
+    return tuple(_missing(fates))
+
+
+def _missing(fates: Mapping[str, Counter[str]]) -> Iterator[Finding]:
+    for kind, count in fates.items():
+        total = sum(count.values())
+        if not total or count[MAPPED]:
+            continue
+        ordered = count.most_common()
+        told = ", ".join(f"{number:,} {fate}" for fate, number in ordered)
+        cause, cure = _WHY.get(ordered[0][0], _UNKNOWN)
+        yield Finding(
+            f"no-{kind}s",
+            f"the map has no {kind}s, of {total:,} {kind} detections: {told}",
+            cause,
+            cure,
+        )
+
+
+def _dropped(dataset: Dataset, prefix: str) -> Counter[str]:
+    """Rows dropped at the door, by fault."""
+    total: Counter[str] = Counter()
+    for journey in dataset.journeys:
+        for reason, count in journey.dropped.items():
+            if reason.startswith(prefix):
+                total[f"dropped at the door: {reason.removeprefix(prefix)}"] += count
+    return total
+
+
+def _fates(
+    label: Int[Tensor, " d"],
+    reason: Int[Tensor, " count"],
+    reasons: Sequence[str],
+    landmark: Int[Tensor, " d"],
+    is_certain: Bool[Tensor, " n"],
+    is_outlier: bool,
+) -> Counter[str]:
+    """Fates of one journey's detections; of several that apply the last that was reached."""
+    kept = OUTLIER_JOURNEY if is_outlier else TOO_FEW_JOURNEYS
+    names = (NO_TRACK, kept, *(_TRACK + why for why in reasons[1:]), IMPROBABLE, MAPPED)
+    # Reason 0 is that the tracklet was kept; label -1 reads the last slot.
+    of_track = torch.cat((reason + 1, reason.new_zeros(1)))
+    of_landmark = torch.cat((is_certain.long() + len(names) - 2, reason.new_zeros(1)))
+    fate = torch.where(landmark >= 0, of_landmark[landmark], of_track[label])
+    count = torch.bincount(fate, minlength=len(names)).tolist()
+    return Counter({name: number for name, number in zip(names, count, strict=True) if number})
