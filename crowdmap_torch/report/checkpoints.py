@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,8 +42,11 @@ def save_checkpoint(
         "module": module.state_dict(),
         "state": state or {},
     }
+    # Torch itself does not say why a disk takes no more.
+    saved = io.BytesIO()
+    torch.save(content, saved)
     with atomic_file(path) as beside:
-        torch.save(content, beside)
+        beside.write_bytes(saved.getbuffer())
 
 
 def load_checkpoint(path: Path, module: nn.Module, *, config_hash: str) -> Checkpoint:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import os
+import socket
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
 import torch
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboard.summary.writer.record_writer import RecordWriter
 from torch import Tensor
 from torch.utils.tensorboard.writer import SummaryWriter
 
@@ -21,11 +28,57 @@ _MAX_SAMPLES = 200_000
 """Histograms are made of an even selection of at most this many numbers."""
 
 
+class _Events:
+    """An event file, written by whoever logs: an OSError is raised where it happens, not in a thread beside."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        name = f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}.{os.getpid()}"
+        number = sum(path.name.startswith(name) for path in folder.iterdir())
+        self._path = folder / f"{name}.{number}"
+        self._file = self._path.open("wb")
+        self._records = RecordWriter(self._file)
+        self._add(Event(wall_time=time.time(), file_version="brain.Event:2"))
+
+    def add_summary(self, summary: Summary, global_step: int | None = None, *_: object) -> None:
+        """What SummaryWriter hands over."""
+        self._add(Event(wall_time=time.time(), step=global_step, summary=summary))
+
+    def flush(self) -> None:
+        """What is written is in the file already."""
+
+    def close(self) -> None:
+        """Closes the file."""
+        with self._named():
+            self._file.close()
+
+    def _add(self, event: Event) -> None:
+        with self._named():
+            self._records.write(event.SerializeToString())
+            self._records.flush()
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
+
+
+class _Writer(SummaryWriter):
+    def _get_file_writer(self) -> _Events:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if self.file_writer is None:
+            self.file_writer = _Events(Path(self.log_dir))
+            self.all_writers = {self.log_dir: self.file_writer}
+        return self.file_writer
+
+
 class TensorBoardLog:
     """Writes one run's numbers by tags that are paths; a context manager that closes the file."""
 
     def __init__(self, folder: Path) -> None:
-        self._writer = SummaryWriter(str(folder), flush_secs=10)
+        """OSError, here as in all that follows, if the disk takes no more."""
+        self._writer = _Writer(str(folder))
 
     def __enter__(self) -> TensorBoardLog:
         return self

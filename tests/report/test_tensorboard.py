@@ -55,3 +55,11 @@ def test_the_config_and_the_maps_are_there(record, tmp_path: Path):
     events = read(tmp_path)
     assert events.Tags()["images"] == ["map/before", "map/after"]
     assert events.Tags()["tensors"] == ["config/text_summary"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_a_full_disk_is_an_error_where_it_happens(tmp_path: Path, monkeypatch):
+    with pytest.raises(OSError, match=r"No space left on device: '.*tfevents"):
+        opened = Path.open
+        monkeypatch.setattr(Path, "open", lambda path, mode: opened(Path("/dev/full"), mode))
+        TensorBoardLog(tmp_path)
