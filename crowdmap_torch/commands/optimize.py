@@ -20,7 +20,7 @@ import torch
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.config import config_hash, dump, load_config
+from crowdmap_torch.config import MapperConfig, config_hash, dump, load_config
 from crowdmap_torch.evaluation.text import format_figures
 from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
 from crowdmap_torch.io.documents import plain
@@ -28,6 +28,7 @@ from crowdmap_torch.io.errors import input_read
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding
+from crowdmap_torch.processes.interrupts import keeping
 from crowdmap_torch.report.checkpoints import load_checkpoint, save_checkpoint
 from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
@@ -83,6 +84,15 @@ def run(options: argparse.Namespace) -> int:
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         config = load_config(options.config)
         device = _device(options.device)
+    # The folder first: whether it can be written, and by nobody else, is known before anything is read at length.
+    with keeping(folder.kept), folder.claimed():
+        return _map(options, folder, config, device)
+
+
+def _map(
+    options: argparse.Namespace, folder: RunFolder, config: MapperConfig, device: torch.device
+) -> int:
+    with input_read():
         dataset = _load(options.dataset, device, strict=options.strict)
         survey = read_survey_of(options.dataset, dataset.origin)
         truth = read_truth_of(options.dataset, dataset, survey)
@@ -132,24 +142,27 @@ def run(options: argparse.Namespace) -> int:
     folder.write_result(dataset, result, config)
 
     # ---- its errors against the survey, the report ----
-    progress("errors and report")
-    figures = figures_before = None
-    if survey is not None:
-        final, before = (
-            certain_part(m, config.min_confidence) for m in (result.hd_map, result.map_clusters)
+    with folder.publishing():
+        progress("errors and report")
+        figures = figures_before = None
+        if survey is not None:
+            final, before = (
+                certain_part(m, config.min_confidence) for m in (result.hd_map, result.map_clusters)
+            )
+            figures = figures_of(final, survey, truth, folder.unfinished, control)
+            figures_before = figures_of(before, survey, truth, None, control)
+            print(format_figures(figures))
+        progress.finish()
+        seconds, compared = progress.seconds, (figures, figures_before)
+        missing = missing_findings(dataset, result, config)
+        _tell(missing, dataset)
+        warnings = (*findings, *missing)
+        metrics = metrics_of(dataset, result, config, watch.iterations, seconds, *compared)
+        folder.write_metrics({**metrics, "warnings": plain(warnings)})
+        record = record_of(
+            dataset, result, config, watch, seconds, survey, truth, *compared, warnings
         )
-        figures = figures_of(final, survey, truth, folder, control)
-        figures_before = figures_of(before, survey, truth, None, control)
-        print(format_figures(figures))
-    progress.finish()
-    seconds, compared = progress.seconds, (figures, figures_before)
-    missing = missing_findings(dataset, result, config)
-    _tell(missing, dataset)
-    warnings = (*findings, *missing)
-    metrics = metrics_of(dataset, result, config, watch.iterations, seconds, *compared)
-    folder.write_metrics({**metrics, "warnings": plain(warnings)})
-    record = record_of(dataset, result, config, watch, seconds, survey, truth, *compared, warnings)
-    write_report(folder.report, record)
+        write_report(folder.unfinished / folder.report.name, record)
     print(f"map: {folder.map}")
     print(f"report: {folder.report}")
     return EMPTY_MAP if options.strict and missing else 0

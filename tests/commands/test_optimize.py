@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
+import signal
+import subprocess
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +20,7 @@ import pytest
 import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from worlds.programs import PATIENCE_S, begin, children, ends
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
@@ -23,6 +28,7 @@ from crowdmap_torch.cli import main
 from crowdmap_torch.commands import optimize as optimize_command
 from crowdmap_torch.config import MapperConfig, load_config
 from crowdmap_torch.io.maps import certain_part, read_map
+from crowdmap_torch.runs.folder import RunFolder
 from crowdmap_torch.tables import Dataset
 
 LANDMARK = {"n_journeys", "n_observations", "first_seen_ns", "last_seen_ns", "confidence"}
@@ -311,6 +317,107 @@ def test_an_older_map_stays_while_the_new_one_is_not_complete(
     with pytest.raises(Interruption):
         optimize(tiny_folder, out, "--overwrite")
     assert {p: p.read_bytes() for p in (out / "map").iterdir()} == before
+
+
+# What stops a run.
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_older_map(
+    optimize, quick, run: Path, tiny_folder: Path, tmp_path: Path, monkeypatch
+):
+    out = Path(shutil.copytree(run, tmp_path / "run"))
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file() and p.suffix != ".pt"}
+
+    def full(path: Path, record: object) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(optimize_command, "write_report", full)
+    said = optimize(tiny_folder, out, "--overwrite")
+    assert said.code == 1
+    assert said.err.splitlines()[-1] == (
+        f"crowdmap optimize: {out}/unfinished/report.html: No space left on device; what was finished is kept: "
+        "the same command with --resume goes on; the older result stands"
+    )
+    assert {p: p.read_bytes() for p in before} == before
+    assert {p.name for p in (out / "unfinished").iterdir()} == {"tensorboard"}
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="nobody may mount")
+@pytest.mark.parametrize("kilobytes", [16, 200])
+def test_a_small_disk_is_one_line(
+    optimize, quick, tiny_folder: Path, tmp_path: Path, kilobytes: int
+):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(disk)]
+    if subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("nobody may mount")
+    try:
+        said = optimize(tiny_folder, disk / "run")
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+    last = said.err.splitlines()[-1]
+    assert said.code == 1 and "Traceback" not in said.err
+    assert last.startswith(f"crowdmap optimize: {disk}/run/") and "No space left on device" in last
+
+
+def test_a_folder_that_another_run_writes_is_refused_before_anything_is_read(
+    optimize, tmp_path: Path
+):
+    folder = RunFolder(tmp_path / "run")
+    with folder.claimed():
+        said = optimize(tmp_path / "no dataset", folder.path)
+    assert said.code == 2 and said.err.count("\n") == 1 and "writes there" in said.err
+
+
+@pytest.mark.parametrize("place", ["file/run", "link", "/proc/run", "x" * 300])
+def test_a_place_for_no_folder_is_refused_before_anything_is_read(
+    optimize, tmp_path: Path, place: str
+):
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "nothing")
+    said = optimize(tmp_path / "no dataset", tmp_path / place)
+    assert said.code == 2 and said.err.count("\n") == 1 and "no dataset" not in said.err
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="nobody tells who are children")
+@pytest.mark.parametrize(
+    ("stage", "number", "code"),
+    [("single journeys", signal.SIGINT, 130), ("clusters", signal.SIGTERM, 143)],
+)
+def test_a_signal_is_one_line_and_leaves_nobody_behind(
+    tiny_folder: Path, tmp_path: Path, stage: str, number: signal.Signals, code: int
+):
+    out = tmp_path / "run"
+    program = begin(
+        *("-m", "crowdmap_torch", "optimize", str(tiny_folder), "--out", str(out)),
+        *("--workers", "2"),
+    )
+    assert program.stderr is not None
+    if stage == "single journeys":
+        while len(children(program.pid)) < 2:
+            assert program.poll() is None
+            time.sleep(0.02)
+    else:
+        said = [program.stderr.readline()]
+        while not said[-1].startswith(stage):
+            assert said[-1], said
+            said.append(program.stderr.readline())
+    workers = children(program.pid)
+    program.send_signal(number)
+    begun = time.monotonic()
+    _, rest = program.communicate(timeout=PATIENCE_S)
+    assert program.returncode == code
+    # Five seconds are promised on a machine that has nothing else to do.
+    assert time.monotonic() - begun < 30
+    *progress, last = rest.splitlines()
+    assert last == (
+        f"crowdmap optimize: ended by {number.name}; what was finished is kept: "
+        "the same command with --resume goes on"
+    )
+    assert all(line.startswith(("clusters", "bundle", "single")) for line in progress)
+    assert all(ends(worker) for worker in workers)
+    assert not (out / "run.lock").exists() and not (out / "map").exists()
 
 
 # Wrong input.
