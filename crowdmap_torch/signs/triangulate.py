@@ -69,8 +69,9 @@ class SignTriangulationConfig:
     """Tracklets with fewer views in agreement must be better placed than others: false detections come in short runs."""
     max_doubtful_sigma_m: float = 0.5
     """Largest standard deviation of those."""
-    size_m: tuple[float, float] = (0.1, 8.0)
-    """Smallest and largest plausible width and height."""
+    size_m: tuple[float, float] = (0.1, 16.5)
+    """Smallest and largest plausible width and height: a board above four lanes of 3.75 m is 15 m wide, and what is found
+    of it may be a tenth more."""
     min_side_m: float = 0.25
     """Smallest plausible larger side: false detections that slide through the image of a creeping car look like tiny
     plates before the lens."""

@@ -45,6 +45,10 @@ class SignConfig:
     back_to_back_share: float = 0.0
     """Share of the posts that carry a sign on their back too."""
     gantries_per_km: float = 0.0
+    wide_boards_per_km: float = 0.0
+    """Single boards across all lanes."""
+    wide_board_m: tuple[float, float] = (9.0, 15.0)
+    """Least and largest width of those."""
     beside_m: tuple[float, float] = (1.5, 4.5)
     """Least and largest distance of a post from the edge of the road."""
     left_share: float = 0.15
@@ -174,6 +178,18 @@ class _Builder:
                 self.hang("rectangle", "US:R3-7", base, travel, 6.2, aside, (1.2, 1.2), wear=0.2)
         self.posts += 1
 
+    def wide_board(self, station: float, lane_centres: tuple[float, ...], direction: int) -> None:
+        """One board above all lanes."""
+        rng = self.rng
+        middle = np.array(float(np.mean(lane_centres)))
+        base = self.road.surface(np.array(station), middle)
+        travel = direction * self.road.tangent_frame(np.array(station), middle)[:, 0]
+        size = (float(rng.uniform(*self.config.wide_board_m)), float(rng.uniform(2.5, 4.0)))
+        rise = 5.6 + size[1] / 2
+        code = str(rng.choice(PANEL_CODES))
+        self.hang("rectangle", code, base, travel, rise, 0.0, size, wear=0.2)
+        self.posts += 1
+
 
 def put_up_signs(
     road: Road,
@@ -199,11 +215,15 @@ def put_up_signs(
             offset = right_edge - beside if on_right else left_edge + beside
             builder.post(station, offset, direction)
         if direction in lane_centres:
-            gantries = round(config.gantries_per_km * (last - first) / 1000)
-            spacing = (last - first) / max(gantries, 1)
-            for k in range(gantries):
-                station = first + spacing * (k + rng.uniform(0.3, 0.7))
-                builder.gantry(station, lane_centres[direction], direction)
+            for per_km, put_up in (
+                (config.gantries_per_km, builder.gantry),
+                (config.wide_boards_per_km, builder.wide_board),
+            ):
+                count = round(per_km * (last - first) / 1000)
+                spacing = (last - first) / max(count, 1)
+                for k in range(count):
+                    station = first + spacing * (k + rng.uniform(0.3, 0.7))
+                    put_up(station, lane_centres[direction], direction)
     rows = builder.rows
     return WorldSigns(
         sign_id=tuple(f"sign-{k:03d}" for k in range(len(rows))),

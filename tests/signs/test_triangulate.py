@@ -76,6 +76,18 @@ def street_map(street) -> tuple[Signs, SignReport]:
     return mapped(street.journey)
 
 
+@pytest.mark.parametrize("width", [12.0, 15.0])
+def test_a_board_above_all_lanes_is_a_sign_of_its_own_size(width: float):
+    poses = straight_poses(120)
+    drive = drive_past(
+        poses, signs_at([(0.0, 110.0, 7.5)]), size=(width, 3.5), noise_px=0.5, depth_m=(16.0, 110.0)
+    )
+    signs, report = mapped(drive.journey)
+    assert report.pruned["kept"] == 1
+    # What signs usually measure, less than a metre, draws it by less than what the pixels leave open.
+    assert signs.size[0].tolist() == pytest.approx([width, 3.5], rel=0.01)
+
+
 def test_every_shape_is_mapped(street, street_map):
     signs, report = street_map
     assert len(signs) == len(ALL_SHAPES)

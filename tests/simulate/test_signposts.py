@@ -51,6 +51,20 @@ def test_gantries_carry_wide_panels_and_signals_2_m_apart():
     assert high.any()
 
 
+def test_wide_boards_hang_above_all_lanes_and_leave_the_other_signs_alone():
+    plain = _signs("highway", length_m=2000.0)
+    config = replace(WORLD_PRESETS["highway"].signs, wide_boards_per_km=3.0)
+    signs = _signs("highway", length_m=2000.0, signs=config)
+    is_board = signs.size[:, 0] > 8.0
+    assert is_board.sum() == 6
+    assert 9.0 <= signs.size[is_board, 0].min() and signs.size[is_board, 0].max() <= 15.0
+    low = signs.corners()[is_board][..., 2].min(1)
+    road = np.median(plain.center[plain.size[:, 0] < 1.0, 2])
+    assert (low > road).all()
+    first = set(map(tuple, plain.center.round(6)[: len(plain) // 2]))
+    assert first <= set(map(tuple, signs.center.round(6)))
+
+
 def test_block_has_signs_back_to_back_and_facing_both_ways():
     signs = _signs("block")
     apart = np.linalg.norm(signs.center[:, None] - signs.center[None], axis=-1)
