@@ -52,6 +52,7 @@ from crowdmap_torch.signs.views import (
     SignViews,
     closest_approach,
     distance_away,
+    held_covariance,
 )
 
 
@@ -198,7 +199,8 @@ def fit_signs_alone(
     own = torch.arange(len(shape), device=shape.device)
     centre = torch.eye(3, 6).to(start.size).expand(len(own), 3, 6)
     normal = DenseBackend().assemble(problem, values)
-    covariance = normal.covariance().of(LinearFunctions((("sign", own),), (centre,)))
+    of_centre = LinearFunctions((("sign", own),), (centre,))
+    covariance = held_covariance(normal.covariance().of(of_centre))
     return SignFit(found.T_world_sign, found.size, frame, covariance, error_sq, 0.0)
 
 
@@ -429,7 +431,7 @@ def _read(
         (("sign", every), ("drift", places.before), ("drift", places.before + 1)),
         (torch.cat((eye, torch.zeros_like(eye)), dim=-1), (1 - share) * by_drift, share * by_drift),
     )
-    covariance = normal.covariance().of(centre)
+    covariance = held_covariance(normal.covariance().of(centre))
     # The one pose has noise of its own, which no path knows.
     sigma_m, sigma_rad = config.white_share * positioning.white_sigma_m, positioning.white_sigma_rad
     own = sigma_m**2 * eye + sigma_rad**2 * turned @ turned.mT

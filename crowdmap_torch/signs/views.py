@@ -16,6 +16,9 @@ from crowdmap_torch.tables import Rows
 APPROACH_FRAMES = 150
 """Frames after a sign's closest view among which its closest approach is looked for."""
 
+UNKNOWN_M = 1e3
+"""1-sigma of a centre whose normal equations have no inverse: such a sign is pruned as too uncertain [m]."""
+
 
 @dataclass(frozen=True)
 class SignViews(Rows):
@@ -62,11 +65,18 @@ class SignFit:
     frame: Int[Tensor, " n"]
     """Of the closest approach: the nearest frame that has the sign in its image, detected or not."""
     covariance: Float[Tensor, "n 3 3"]
-    """Of the centre, relative to the pose at that frame [m^2]."""
+    """Of the centre, relative to the pose at that frame [m^2]; that of `UNKNOWN_M` where the views leave it open."""
     error_sq: Float[Tensor, " m"]
     """Mean square of each view's whitened error; views beyond `tukey` squared have no say."""
     drift_scale: float
     """By how much the poses drift, in multiples of what is usual."""
+
+
+def held_covariance(covariance: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
+    """The covariances, with that of `UNKNOWN_M` in place of those that are not finite."""
+    eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    is_known = covariance.isfinite().flatten(1).all(1)
+    return torch.where(is_known[:, None, None], covariance, UNKNOWN_M**2 * eye)
 
 
 def distance_away(views: SignViews, fit: SignFit | SignStart) -> Float[Tensor, " m"]:

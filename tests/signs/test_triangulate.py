@@ -34,7 +34,7 @@ from crowdmap_torch.signs.triangulate import (
     SignTriangulationConfig,
     triangulate_signs,
 )
-from crowdmap_torch.tables import Journey, Signs, SurveySigns, Tracklets
+from crowdmap_torch.tables import Dataset, Journey, Signs, SurveySigns, Tracklets
 from crowdmap_torch.tracking.sign_features import SignAssociationConfig
 from crowdmap_torch.tracking.signs import associate_signs
 
@@ -86,6 +86,17 @@ def test_a_board_above_all_lanes_is_a_sign_of_its_own_size(width: float):
     assert report.pruned["kept"] == 1
     # What signs usually measure, less than a metre, draws it by less than what the pixels leave open.
     assert signs.size[0].tolist() == pytest.approx([width, 3.5], rel=0.01)
+
+
+def test_poses_that_leap_and_leap_back_leave_nothing_but_open_signs(tiny: Dataset):
+    """Positioning that is 500 km off for a while: the drift's normal equations have no inverse."""
+    drive = tiny.journeys[0]
+    T, n = drive.T_world_camera.clone(), drive.frame_count
+    T[3 * n // 10 : 6 * n // 10, 0, 3] += 5e5
+    signs, report = mapped(replace(drive, T_world_camera=T))
+    assert report.pruned["position too uncertain"] > 0
+    assert bool(signs.covariance.isfinite().all())
+    assert bool((signs.covariance.diagonal(dim1=1, dim2=2) < CONFIG.max_sigma_m**2).all())
 
 
 def test_every_shape_is_mapped(street, street_map):

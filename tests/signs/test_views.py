@@ -13,13 +13,22 @@ from crowdmap_torch.noise.positioning import DriftPathConfig, PositioningNoise
 from crowdmap_torch.road.nonholonomic import DrivePath, NonholonomicConfig, drive_path
 from crowdmap_torch.signs.triangulate import shape_by_vote, usable_rows, views_of
 from crowdmap_torch.signs.views import (
+    UNKNOWN_M,
     SignStart,
     SignViews,
     closest_approach,
     distance_away,
+    held_covariance,
     thinned,
 )
 from crowdmap_torch.tables import Tracklets
+
+
+def test_a_covariance_that_is_not_known_is_a_large_one():
+    known = torch.eye(3, dtype=F64)
+    found = held_covariance(torch.stack((known, known * torch.nan, known * torch.inf)))
+    assert found.diagonal(dim1=1, dim2=2).tolist() == [[1.0] * 3, [1e6] * 3, [1e6] * 3]
+    assert bool((found[1:] == UNKNOWN_M**2 * known).all())
 
 
 def path_of(poses: torch.Tensor) -> DrivePath:

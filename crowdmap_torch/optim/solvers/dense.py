@@ -82,9 +82,13 @@ class DenseNormalEquations:
         return solved_step(self.where.unpack(step), part, solved=solved)
 
     def covariance(self, *, floor: float = 1e-12) -> DenseCovariance:
-        """Inverse of the Gauss-Newton Hessian; padding and unobserved directions get a large variance."""
+        """Inverse of the Gauss-Newton Hessian; padding and unobserved directions get a large variance.
+
+        NaN where there is no inverse.
+        """
         pad = (~self.where.used).to(self.hessian) + floor
-        return DenseCovariance(torch.linalg.inv(self.hessian + torch.diag_embed(pad)), self.where)
+        inverse, failed = torch.linalg.inv_ex(self.hessian + torch.diag_embed(pad))
+        return DenseCovariance(inverse.where((failed == 0)[:, None, None], torch.nan), self.where)
 
 
 @dataclass(frozen=True)
