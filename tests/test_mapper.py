@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
+from worlds.degenerate import KINDS, degenerate
 from worlds.drives import shuffled, turn_about_up, with_frames
 
 from crowdmap_torch.config import MapperConfig
@@ -16,7 +17,9 @@ from crowdmap_torch.geometry import se3, spline_length
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult, build_map, map_journeys
+from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.tables import Dataset, HdMap, Journey
 
 CONFIG = MapperConfig()
@@ -193,6 +196,32 @@ def test_journeys_without_detections_give_a_map_of_nothing(tiny: Dataset, method
     assert len(result.hd_map.signs) == len(result.hd_map.lanes) == 0
     for journey, poses in zip(journeys, result.poses, strict=True):
         assert torch.allclose(poses, journey.T_world_camera)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_drives_with_next_to_nothing_in_them_give_finite_numbers(
+    tiny: Dataset, tiny_truth: Truth, kind: str
+):
+    dataset = replace(tiny, journeys=degenerate(tiny_truth, kind))
+    few = replace(CONFIG.adjust, lm=replace(CONFIG.adjust.lm, max_iterations=2))
+    result = build_map(dataset, replace(CONFIG, adjust=few))
+    for table in (result.hd_map, result.map_clusters):
+        signs, lanes = table.signs, table.lanes
+        numbers = (signs.T_world_sign, signs.size, signs.covariance, signs.confidence)
+        for tensor in (*numbers, lanes.control.point_world, lanes.control.sigma):
+            assert bool(tensor.isfinite().all())
+        assert bool((torch.linalg.eigvalsh(signs.covariance) > 0).all())
+        assert bool((lanes.control.sigma > 0).all())
+        assert bool(table.shared_covariance.isfinite().all())
+    assert all(bool(poses.isfinite().all()) for poses in result.poses)
+    # Nobody places anything better than its journeys' own positions, a few decimetres, allow.
+    hd_map = certain_part(result.hd_map, CONFIG.min_confidence)
+    sigma = hd_map.signs.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    assert bool((sigma > 0.4 / len(dataset.journeys) ** 0.5 / 2).all())
+    # What is missing from the map is told.
+    found = {finding.kind for finding in missing_findings(dataset, result, CONFIG)}
+    seen = any(len(journey.signs) for journey in dataset.journeys)
+    assert ("no-signs" in found) == (seen and not len(hd_map.signs))
 
 
 def test_adjusting_one_real_drive_of_boxes_keeps_its_signs_in_place(real_data):
