@@ -164,8 +164,9 @@ class SingleJourneyMapper:
 
     def _held_signs(self) -> Int[Tensor, " n"]:
         """Tracklets of signs that were not mapped yet."""
-        none = torch.zeros(0, dtype=torch.int64)
-        label = torch.cat([none, *(held.sign_label for held in self._held)]).unique()
+        if not self._held:
+            return torch.zeros(0, dtype=torch.int64)
+        label = torch.cat([held.sign_label for held in self._held]).unique()
         return label[label >= 0]
 
     def _ended_signs(self) -> Int[Tensor, " n"]:

@@ -7,9 +7,9 @@ as the driver sees it, z the normal that points at the driver; its origin is the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -43,6 +43,24 @@ class Rows:
         columns = {f.name: getattr(self, f.name) for f in fields(self)}
         changed = {k: function(v) for k, v in columns.items() if isinstance(v, Tensor)}
         return replace(self, **changed)
+
+
+def to_device(value: Any, device: torch.device | str) -> Any:
+    """The same on another device, down to the last tensor in records, tuples and mappings."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if is_dataclass(value) and not isinstance(value, type):
+        held = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
+        moved = {name: to_device(x, device) for name, x in held.items()}
+        changed = {name: x for name, x in moved.items() if x is not held[name]}
+        return replace(value, **changed) if changed else value
+    if isinstance(value, Mapping):
+        moved = {key: to_device(x, device) for key, x in value.items()}
+        return moved if any(moved[key] is not x for key, x in value.items()) else value
+    if type(value) in (tuple, list):
+        items = type(value)(to_device(x, device) for x in value)
+        return items if any(a is not b for a, b in zip(items, value, strict=True)) else value
+    return value
 
 
 def concatenate(tables: Sequence[Table]) -> Table:
@@ -140,23 +158,7 @@ class Journey:
 
     def to(self, device: torch.device | str) -> Journey:
         """The same journey on another device."""
-        camera = replace(
-            self.rig.camera,
-            K=self.rig.camera.K.to(device),
-            distortion=self.rig.camera.distortion.to(device),
-        )
-        rig = replace(
-            self.rig,
-            camera=camera,
-            T_link_camera=self.rig.T_link_camera.to(device),
-            road_normal_camera=self.rig.road_normal_camera.to(device),
-        )
-        moved = {
-            f.name: getattr(self, f.name).to(device)
-            for f in fields(self)
-            if isinstance(getattr(self, f.name), (Tensor, Rows))
-        }
-        return replace(self, rig=rig, **moved)
+        return to_device(self, device)
 
 
 @dataclass(frozen=True)

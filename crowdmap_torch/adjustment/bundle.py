@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -24,6 +25,7 @@ from crowdmap_torch.optim.solvers.normal_equations import MapBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.residuals import lane, reprojection, sign_prior
 from crowdmap_torch.residuals.sign_prior import SignHabit
+from crowdmap_torch.tables import to_device
 
 _PIXEL_DIM = 2
 """Numbers of a corner's residual: u and v."""
@@ -200,7 +202,7 @@ class Bundle(nn.Module):
             self.register_buffer(f"base_{name}", value.clone())
             increment = value.new_zeros(len(value), self.variables[name].tangent_dim)
             self.register_parameter(f"delta_{name}", nn.Parameter(increment))
-        self.register_buffer("scale", torch.full((3,), torch.inf, dtype=values["pose"].dtype))
+        self.register_buffer("scale", values["pose"].new_full((3,), torch.inf))
         self.register_buffer("small_box", torch.zeros_like(self.scale[0]))
         last = int(corners.detection.max()) + 1 if len(corners) else 0
         given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
@@ -217,6 +219,12 @@ class Bundle(nn.Module):
         self.register_buffer("match_valid", self.matches.valid.clone())
         self.is_refreshed = False
         self.register_load_state_dict_post_hook(_forget_refresh)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Bundle:
+        """What `.to(device)` calls: the tables follow the unknowns."""
+        super()._apply(fn, recurse)
+        self.__dict__.update(to_device(vars(self), self.scale.device))
+        return self
 
     def values(self) -> dict[str, Tensor]:
         """Base values moved by the increments."""

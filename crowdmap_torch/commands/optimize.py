@@ -45,7 +45,7 @@ from crowdmap_torch.runs.folder import (
     refuse_overlap,
 )
 from crowdmap_torch.runs.metrics import metrics_of
-from crowdmap_torch.tables import Dataset, RejectedJourney
+from crowdmap_torch.tables import Dataset, RejectedJourney, to_device
 
 EMPTY_MAP = 3
 """Exit code with `--strict` where a map was written without the signs or lanes that were detected."""
@@ -139,6 +139,8 @@ def _map(
         progress("covariances and map")
         result = mapper.finish_map(dataset, maps, first, bundle, state, config)
         watch.finish(bundle, result.hd_map)
+    # What follows is written and drawn: on the CPU, wherever it was made.
+    dataset, result = to_device((dataset, result), "cpu")
     folder.write_result(dataset, result, config)
 
     # ---- its errors against the survey, the report ----

@@ -33,7 +33,7 @@ from crowdmap_torch.evaluation.uncertainty import evaluate_uncertainty
 from crowdmap_torch.evaluation.visibility import observable_signs, oracle_figures, seen_by_journeys
 from crowdmap_torch.io.truth import SignAssociations, Truth
 from crowdmap_torch.survey.matching import SurveyMatchConfig
-from crowdmap_torch.tables import HdMap, Lanes, Origin, Signs, Survey
+from crowdmap_torch.tables import HdMap, Lanes, Origin, Signs, Survey, to_device
 
 _SAME_DEGREES = 1e-9
 _SAME_METRES = 1e-3
@@ -61,6 +61,8 @@ def evaluate_map(
     `observable_ids` names those that are. ValueError if the origins differ.
     """
     refuse_other_origin(hd_map.origin, survey.origin)
+    hd_map, survey, truth = to_device((hd_map, survey, truth), "cpu")
+    associations, landmarks = to_device((associations, landmarks), "cpu")
     config = SignEvaluationConfig(match=SurveyMatchConfig(gate_m=gate_m))
     observable = None
     if observable_ids is not None:
@@ -130,6 +132,7 @@ def progress_scalars(
 ) -> dict[str, float]:
     """Errors of an unfinished map by TensorBoard tag, cheap enough for every iteration."""
     config = SignEvaluationConfig(match=SurveyMatchConfig(gate_m=gate_m))
+    signs, lanes = to_device(signs, "cpu"), to_device(lanes, "cpu")
     figures = evaluate_signs(
         signs, survey.signs, observable=observable, control=control, config=config
     )

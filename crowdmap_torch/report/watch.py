@@ -98,4 +98,4 @@ def pixel_residuals(bundle: Bundle) -> Float[Tensor, " m"]:
     term = bundle.problem().terms.get("sign_reprojection")
     if term is None or not len(term):
         return bundle.scale.new_zeros(0)
-    return residuals(term, bundle.values()).norm(dim=-1) * bundle.corner_sigma()
+    return (residuals(term, bundle.values()).norm(dim=-1) * bundle.corner_sigma()).cpu()

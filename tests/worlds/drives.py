@@ -17,8 +17,8 @@ from crowdmap_torch.simulate.worlds import WORLD_PRESETS
 from crowdmap_torch.tables import Journey, LaneDetections, LanePoints, Rig, SignDetections
 
 
-def write_tiny(out: Path, *, journeys: int = 3) -> Path:
-    """A dataset of a short street with a few signs, seen eight times a second; returns `out`."""
+def write_tiny(out: Path, *, journeys: int = 3, frame_rate_hz: float = 8.0) -> Path:
+    """A dataset of a short street with a few signs; returns `out`."""
     street = WORLD_PRESETS["street"]
     config = SimulationConfig(
         world=replace(
@@ -27,7 +27,7 @@ def write_tiny(out: Path, *, journeys: int = 3) -> Path:
             lights_per_km=0.0,
             signs=replace(street.signs, posts_per_km=60.0),
         ),
-        vehicle=VehicleConfig(frame_rate_hz=8.0),
+        vehicle=VehicleConfig(frame_rate_hz=frame_rate_hz),
         rig=RigConfig(camera="pinhole"),
         journeys=journeys,
     )

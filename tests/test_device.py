@@ -1,0 +1,208 @@
+"""Everything follows the data's device: the whole mapper on a pretended one, to the same bits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from worlds.drives import with_frames, write_tiny
+from worlds.pretend_device import DEVICE, PretendTensor, Transfers, pretend_device
+
+from crowdmap_torch import cli, mapper
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.evaluation.evaluate import evaluate_map, progress_scalars
+from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.io.truth import read_truth
+from crowdmap_torch.optim.linearize import term_costs
+from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of
+from crowdmap_torch.tables import Dataset, Rows, to_device
+
+STEPS = 2
+CONFIG = f"adjust:\n  lm:\n    max_iterations: {STEPS}\n"
+
+
+def short() -> MapperConfig:
+    """The default configuration, with few steps of adjustment."""
+    config = MapperConfig()
+    lm = replace(config.adjust.lm, max_iterations=STEPS)
+    return replace(config, adjust=replace(config.adjust, lm=lm))
+
+
+@pytest.fixture(scope="module")
+def transfers() -> Iterator[Transfers]:
+    """The device is there for all tests of this file."""
+    with pretend_device() as counted:
+        yield counted
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two short journeys: every operation is looked at, which takes its time."""
+    out = tmp_path_factory.mktemp("device") / "dataset"
+    return write_tiny(out, journeys=2, frame_rate_hz=4.0)
+
+
+@pytest.fixture(scope="module")
+def here(folder: Path) -> Dataset:
+    return load_dataset(folder)
+
+
+@pytest.fixture(scope="module")
+def there(here: Dataset, transfers: Transfers) -> Dataset:
+    return to_device(here, DEVICE)
+
+
+Stages = tuple[tuple[mapper.JourneyMap, ...], mapper.FirstMap]
+
+
+def mapped(dataset: Dataset) -> Stages:
+    maps = mapper.map_journeys(dataset.journeys, short())
+    return maps, mapper.first_map(dataset.journeys, maps, short())
+
+
+@pytest.fixture(scope="module")
+def first(there: Dataset) -> Stages:
+    return mapped(there)
+
+
+@pytest.fixture(scope="module")
+def first_here(here: Dataset) -> Stages:
+    return mapped(here)
+
+
+def finished(dataset: Dataset, maps, heads) -> mapper.MapResult:
+    bundle = mapper.build_bundle(dataset.journeys, maps, heads, short())
+    state = begun = adjust.start(bundle)
+    for _, after in adjust.steps(bundle, begun):
+        state = after
+    return mapper.finish_map(dataset, maps, heads, bundle, state, short())
+
+
+def differences(a: Rows, b: Rows) -> Iterator[str]:
+    """Columns of two tables of which not every bit is the same."""
+    for f in fields(a):
+        one, other = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(one, Tensor) and not torch.equal(one.cpu(), other.cpu()):
+            yield f.name
+
+
+def test_tensors_of_two_devices_do_not_meet(transfers: Transfers):
+    here, away = torch.ones(3), torch.ones(3, device=DEVICE)
+    assert isinstance(away, PretendTensor) and away.is_cuda and away.device == DEVICE
+    with pytest.raises(RuntimeError, match="on one device"):
+        away.add(here)
+    with pytest.raises(RuntimeError, match="on one device"):
+        here[away.long()]
+    with pytest.raises(TypeError, match=r"\.cpu\(\)"):
+        away.numpy()
+    transfers.clear()
+    assert float((away + here.sum()).sum()) == 12.0
+    assert (transfers.scalars, sum(transfers.back.values())) == (1, 0)
+    assert away.tolist() == [1.0, 1.0, 1.0]
+    assert transfers.back == {(3,): 1}
+
+
+def test_tables_move_down_to_the_last_tensor(there: Dataset):
+    def tensors(value: object) -> Iterator[Tensor]:
+        if isinstance(value, Tensor):
+            yield value
+        elif is_dataclass(value):
+            for f in fields(value):
+                yield from tensors(getattr(value, f.name))
+
+    for journey in there.journeys:
+        assert all(isinstance(x, PretendTensor) for x in tensors(journey))
+    assert to_device(there, DEVICE).journeys[0] is there.journeys[0]
+
+
+def test_the_map_is_the_cpus_to_the_last_bit(here: Dataset, there: Dataset, first, first_here):
+    made, expected = finished(there, *first), finished(here, *first_here)
+    assert isinstance(made.hd_map.signs.T_world_sign, PretendTensor)
+    assert len(made.hd_map.signs) and len(made.hd_map.lanes)
+    for name in ("signs", "lanes"):
+        a, b = getattr(made.hd_map, name), getattr(expected.hd_map, name)
+        assert list(differences(a, b)) == []
+    assert torch.equal(made.hd_map.shared_covariance.cpu(), expected.hd_map.shared_covariance)
+    assert all(torch.equal(a.cpu(), b) for a, b in zip(made.poses, expected.poses, strict=True))
+
+
+def test_a_step_brings_no_poses_and_no_observations_back(there: Dataset, first, transfers):
+    maps, heads = first
+    bundle = mapper.build_bundle(there.journeys, maps, heads, short())
+    begun = adjust.start(bundle)
+    transfers.clear()
+    for _ in adjust.steps(bundle, begun):
+        # Which landmark which block sees is ordered on the CPU; no coordinate leaves the device.
+        assert all(len(shape) == 1 for shape in transfers.back), transfers.back
+        assert sum(transfers.back.values()) <= 24
+        assert transfers.scalars <= 400
+        transfers.clear()
+
+
+def test_a_bundle_moves_with_all_that_it_holds(here: Dataset, first_here, transfers: Transfers):
+    maps, heads = first_here
+    bundle = mapper.build_bundle(here.journeys, maps, heads, short())
+    costs = term_costs(bundle.problem(), bundle.values())
+    moved = bundle.to(DEVICE)
+    with torch.no_grad():
+        again = term_costs(moved.problem(), moved.values())
+    for name, cost in again.items():
+        assert isinstance(cost, PretendTensor), name
+        assert torch.equal(cost.cpu(), costs[name]), name
+
+
+def test_maps_on_a_device_are_judged_beside_a_survey_on_the_cpu(
+    folder: Path, here: Dataset, there: Dataset, first
+):
+    heads = first[1]
+    survey = read_survey(folder / "survey")
+    truth = read_truth(folder / "survey", survey, here.journeys)
+    clusters = mapper.clusters_map(there, heads)
+    figures = evaluate_map(clusters, survey, truth=truth)
+    same = evaluate_map(to_device(clusters, "cpu"), survey, truth=truth)
+    assert figures.signs.absolute == same.signs.absolute
+    scalars = progress_scalars(heads.signs, survey, lanes=heads.lanes)
+    signs, lanes = to_device((heads.signs, heads.lanes), "cpu")
+    assert scalars == progress_scalars(signs, survey, lanes=lanes)
+
+
+class AtOnce:
+    """An executor without a thread: what torch is told to look at, it looks at in one thread alone."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        pass
+
+    def submit(self, work: Callable[..., object], *args: object) -> Future:
+        done: Future = Future()
+        done.set_result(work(*args))
+        return done
+
+
+def test_a_drive_is_mapped_frame_by_frame(here: Dataset, transfers, monkeypatch):
+    monkeypatch.setattr("crowdmap_torch.single_journey.ThreadPoolExecutor", AtOnce)
+    part = with_frames(here.journeys[0], torch.arange(40))
+    runs = []
+    for journey in (part, to_device(part, DEVICE)):
+        one = SingleJourneyMapper(journey.rig)
+        labels = [one.step(frame_of(journey, i)).sign_tracklet.cpu() for i in range(40)]
+        runs.append((torch.cat(labels), *one.finish()))
+    (labels, signs, lanes), (labels_there, *made_there) = runs
+    assert torch.equal(labels, labels_there)
+    for table, other in zip((signs, lanes), made_there, strict=True):
+        assert isinstance(table, Rows) and list(differences(table, other)) == []
+
+
+def test_optimize_maps_and_reports(folder: Path, tmp_path: Path, transfers, capsys):
+    config, run = tmp_path / "short.yaml", tmp_path / "run"
+    config.write_text(CONFIG)
+    options = ["--config", str(config), "--device", "cuda:0", "--log-every", "2"]
+    assert cli.main(["optimize", str(folder), "--out", str(run), *options]) == 0
+    assert (run / "report.html").exists()
+    assert "relative corner" in capsys.readouterr().out
