@@ -57,8 +57,8 @@ def to_device(value: Any, device: torch.device | str) -> Any:
     if isinstance(value, Mapping):
         moved = {key: to_device(x, device) for key, x in value.items()}
         return moved if any(moved[key] is not x for key, x in value.items()) else value
-    if type(value) in (tuple, list):
-        items = type(value)(to_device(x, device) for x in value)
+    if isinstance(value, tuple):
+        items = tuple(to_device(x, device) for x in value)
         return items if any(a is not b for a, b in zip(items, value, strict=True)) else value
     return value
 
