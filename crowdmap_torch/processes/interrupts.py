@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
 
-GRACE_S = 2.5
+GRACE_S = 2.0
 """How long clearing away may take before the process ends without it."""
 _AGAIN_S = 0.02
 """After this time an interruption that was swallowed is tried again."""

@@ -23,6 +23,8 @@ from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any
 
+from crowdmap_torch.processes.interrupts import held
+
 _BEGIN = (
     "import json, sys; number, parent, sys.path[:] = json.loads(sys.argv[1]); "
     "from crowdmap_torch.processes.workers import serve; serve(number, parent)"
@@ -55,6 +57,7 @@ class Workers:
         """Each process calls `begin(*arguments)` first."""
         self._count = count
         self._begin = pickle.dumps((begin, arguments))
+        self._processes: list[subprocess.Popen] = []
         self._idle: list[_Worker] = []
         self._busy: dict[Connection, _Worker] = {}
 
@@ -108,16 +111,17 @@ class Workers:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        workers = [*self._idle, *self._busy.values()]
-        for worker in workers:
-            worker.process.kill()
+        for process in self._processes:
+            process.kill()
+        for worker in (*self._idle, *self._busy.values()):
             worker.connection.close()
-        for worker in workers:
-            worker.process.wait()
+        for process in self._processes:
+            process.wait()
 
     def _new(self) -> _Worker:
         ours, theirs = socket.socketpair()
-        with theirs:
+        # A signal that came before the process is listed would leave it behind until it looks for its parent.
+        with held(), theirs:
             told = json.dumps([theirs.fileno(), os.getpid(), sys.path])
             # They are born deaf: the signals of a terminal reach them before their first line does.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEFT_TO_PARENT)
@@ -127,6 +131,7 @@ class Workers:
                     stdin=subprocess.DEVNULL,
                     pass_fds=(theirs.fileno(),),
                 )
+                self._processes.append(process)
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
         worker = _Worker(process, Connection(ours.detach()))
