@@ -53,6 +53,14 @@ _WHY: dict[str, tuple[str, str]] = {
         "what is mapped would be far too small or too large",
         "check the focal length and that positions are in metres",
     ),
+    _TRACK + "position too uncertain": (
+        "few views, or views from afar, place nothing",
+        "add drives that go by, or frames",
+    ),
+    _TRACK + "too short": (
+        "lane markers are seen for a few metres only",
+        "check that lane points reach far enough ahead",
+    ),
     _TRACK + "no points near enough": (
         "lane points do not lie on the road before the car",
         "check the rig's road normal and height",

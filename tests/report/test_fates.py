@@ -11,8 +11,10 @@ from worlds.drives import without_detections
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.crowd_signs.outlier_journeys import OutlierJourney
 from crowdmap_torch.io.datasets import row_count
+from crowdmap_torch.lanes import reconstruct
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.report.fates import (
+    _WHY,
     IMPROBABLE,
     MAPPED,
     NO_TRACK,
@@ -22,6 +24,7 @@ from crowdmap_torch.report.fates import (
     missing_findings,
     sign_fates,
 )
+from crowdmap_torch.signs import triangulate
 from crowdmap_torch.tables import Association, Dataset
 
 CONFIG = MapperConfig()
@@ -91,6 +94,12 @@ def test_an_empty_map_is_told_with_a_count_for_every_reason(
     ):
         assert all(f"{count:,} {fate}" in finding.evidence for fate, count in fates.items())
         assert "\n" not in finding.line(3)
+
+
+def test_every_fate_that_is_explained_exists() -> None:
+    tracks = {f"in a track: {why}" for why in (*triangulate.REASONS, *reconstruct.REASONS)}
+    others = {NO_TRACK, OUTLIER_JOURNEY, TOO_FEW_JOURNEYS, IMPROBABLE}
+    assert _WHY.keys() <= tracks | others
 
 
 def test_a_map_with_what_was_detected_is_not_told_of(tiny: Dataset, tiny_result: MapResult) -> None:
