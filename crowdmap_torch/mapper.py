@@ -7,7 +7,7 @@ does it all; `commands/optimize.py` spells out the same calls with logging betwe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -77,6 +77,13 @@ class JourneyMap:
     lane_report: LaneReport
 
 
+KeepCall = Callable[[int, JourneyMap], object]
+
+
+def forget(number: int, made: JourneyMap) -> None:
+    """Keeps nothing."""
+
+
 @dataclass(frozen=True)
 class FirstMap:
     """The map of the cluster heads, and all that bundle adjustment starts from (section V)."""
@@ -142,26 +149,37 @@ def map_journeys(
     *,
     workers: int = 1,
     progress: ProgressCall = silent,
+    known: Mapping[int, JourneyMap] | None = None,
+    keep: KeepCall = forget,
 ) -> tuple[JourneyMap, ...]:
     """Section IV for every journey, `workers` at a time, each on one core; the result does not depend on how many.
 
-    ChildProcessError, with the journey's name, if the process of a journey is killed.
+    Those that are `known`, by number, are taken as they are; `keep` is handed the others with their numbers, as soon as
+    each is there. ChildProcessError, with the journey's name, if the process of a journey is killed.
     """
     stage, total = "single journeys", len(journeys)
-    progress(stage, 0, total)
-    if workers <= 1 or total <= 1 or journeys[0].t_ns.is_cuda:
-        maps = []
-        for number, journey in enumerate(journeys):
-            maps.append(map_journey(journey, number, config))
-            progress(stage, number + 1, total)
-        return tuple(maps)
-    calls = ((j.journey_id, map_journey, (j, number, config)) for number, j in enumerate(journeys))
-    made: dict[int, JourneyMap] = {}
-    with Workers(min(workers, total), torch.set_num_threads, 1) as pool:
-        for number, journey_map in pool.each(calls):
-            made[number] = journey_map
-            progress(stage, len(made), total)
-    return tuple(made[number] for number in range(total))
+    maps = dict(known or {})
+    progress(stage, len(maps), total)
+    for number, made in _mapped(journeys, config, workers, maps.keys()):
+        maps[number] = made
+        keep(number, made)
+        progress(stage, len(maps), total)
+    return tuple(maps[number] for number in range(total))
+
+
+def _mapped(
+    journeys: Sequence[Journey], config: MapperConfig, workers: int, known: Collection[int]
+) -> Iterator[tuple[int, JourneyMap]]:
+    """The maps of the journeys that are not `known`, in whatever order they are there."""
+    left = [number for number in range(len(journeys)) if number not in known]
+    if workers <= 1 or len(left) <= 1 or journeys[0].t_ns.is_cuda:
+        for number in left:
+            yield number, map_journey(journeys[number], number, config)
+        return
+    calls = ((journeys[n].journey_id, map_journey, (journeys[n], n, config)) for n in left)
+    with Workers(min(workers, len(left)), torch.set_num_threads, 1) as pool:
+        for place, made in pool.each(calls):
+            yield left[place], made
 
 
 @torch.no_grad()

@@ -1,14 +1,15 @@
 """V-B: bundle adjustment of camera poses, signs and lanes of all journeys (eq:ba).
 
 `build` makes a `Bundle` from journeys, a first map and the associations. `start` matches its lanes and finds its scales, the
-loop over `steps` adjusts it, and `adjust` is both for those who watch nothing on the way. `read_map` and `read_poses`
-give the result.
+loop over `steps` adjusts it, and `adjust` is both for those who watch nothing on the way. Between two steps `standing` is
+all that the next ones follow from; a bundle that is built alike goes on from there by `go_on`. `read_map` and
+`read_poses` give the result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -143,6 +144,7 @@ def adjust(bundle: Bundle) -> lm.LmState:
 @torch.no_grad()
 def start(bundle: Bundle) -> lm.LmState:
     """The state before the first step: lanes matched, scales as wide as the residuals show."""
+    bundle.fold(bundle.values())
     bundle.refresh()
     return lm.init(bundle.problem(), bundle.values(), bundle.config.lm)
 
@@ -151,10 +153,52 @@ def steps(bundle: Bundle, state: lm.LmState, *, first: int = 0) -> Iterator[tupl
     """Every step's number, from `first` on, and the state after it, until the adjustment is finished or out of steps."""
     backend = bundle.backend()
     for number in range(first, bundle.config.lm.max_iterations):
-        state, finished = adjust_step(bundle, state, backend)
-        yield number, state
-        if finished:
+        # What goes on with more to do was set running again: a state that is done was the last one.
+        if number and state.done:
             break
+        state, _ = adjust_step(bundle, state, backend)
+        yield number, state
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where an adjustment stands between two steps: all that the next ones follow from, beside what `build` makes."""
+
+    steps: int
+    """How many were taken."""
+    state: lm.LmState
+    """Without its normal equations, which follow from its values."""
+    bundle: Mapping[str, Tensor]
+    """What changes of a bundle, by name, but for its unknowns: those are the values of the state."""
+
+
+def standing(bundle: Bundle, state: lm.LmState, steps: int) -> Standing:
+    """Where the adjustment stands after `steps` steps; the tensors are the bundle's own, which the next step changes."""
+    beside = {k: v for k, v in bundle.state_dict().items() if k not in bundle.unknown_names}
+    return Standing(steps, replace(state, normal=None, proposed=None), beside)
+
+
+@torch.no_grad()
+def go_on(bundle: Bundle, standing: Standing) -> lm.LmState:
+    """Puts a bundle that was built alike where another one stood: the steps from there are the same to the last bit.
+
+    ValueError if it was another one's.
+    """
+    own, values = bundle.state_dict(), bundle.values()
+    beside = {k: v for k, v in own.items() if k not in bundle.unknown_names}
+    for here, there in ((beside, standing.bundle), (values, standing.state.values)):
+        for name in {*here, *there}:
+            if _kind(here.get(name)) != _kind(there.get(name)):
+                raise ValueError(
+                    f"{name!r} is {_kind(there.get(name))}; expected {_kind(here.get(name))}, as the bundle has it"
+                )
+    bundle.load_state_dict({**own, **standing.bundle})
+    bundle.fold(dict(standing.state.values))
+    return standing.state
+
+
+def _kind(tensor: Tensor | None) -> str:
+    return "missing" if tensor is None else f"{tensor.dtype} {list(tensor.shape)}"
 
 
 @torch.no_grad()

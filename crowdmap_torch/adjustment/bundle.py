@@ -173,12 +173,15 @@ class Bundle(nn.Module):
     """The unknowns of bundle adjustment and all observations of them.
 
     Every unknown is a base value on its manifold (a buffer) and a tangent increment (an `nn.Parameter`) that is zero at
-    rest: `state_dict()` is the checkpoint, `.to(device)` moves everything, and an optimiser that steps the increments
-    stays on the manifold.
+    rest: `state_dict()` is all that changes, and a bundle that loads it goes on as if it had never stopped; an optimiser
+    that steps the increments stays on the manifold.
     """
 
     match_t: Tensor
+    match_normal: Tensor
     match_valid: Tensor
+    refreshed: Tensor
+    """Whether matches and scales have been found."""
     scale: Tensor
     """Standard deviation of sign corners of large boxes, and of lane points [px], as the residuals show it; factor on
     that of lane points, as those of one detection err together."""
@@ -211,14 +214,25 @@ class Bundle(nn.Module):
         self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points
-        self.matches = observations.matches
         self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
         self.config = config
-        # Where each lane point was followed to is part of the checkpoint: matching starts from there.
-        self.register_buffer("match_t", self.matches.t.clone())
-        self.register_buffer("match_valid", self.matches.valid.clone())
-        self.is_refreshed = False
-        self.register_load_state_dict_post_hook(_forget_refresh)
+        # Where each lane point was followed to is part of the state: matching starts from there.
+        matches = observations.matches
+        self._match_lane = matches.lane
+        self.register_buffer("match_t", matches.t.clone())
+        self.register_buffer("match_normal", matches.normal_px.clone())
+        self.register_buffer("match_valid", matches.valid.clone())
+        self.register_buffer("refreshed", torch.zeros_like(self.judged, dtype=torch.bool))
+
+    @property
+    def matches(self) -> LaneMatches:
+        """The spline point that each lane point is held against."""
+        return LaneMatches(self._match_lane, self.match_t, self.match_normal, self.match_valid)
+
+    @property
+    def unknown_names(self) -> set[str]:
+        """The unknowns' names in `state_dict()`."""
+        return {f"{part}_{name}" for part in ("base", "delta") for name in self.names}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Bundle:
         """What `.to(device)` calls: the tables follow the unknowns."""
@@ -262,15 +276,15 @@ class Bundle(nn.Module):
         values = self.values()
         if len(self.lane_points):
             pose = values["pose"][self.lane_points.frame]
-            last = replace(self.matches, t=self.match_t, valid=self.match_valid)
-            self.matches = follow(last, self.lane_points, pose, values["lane"], self.lane_count)
-            self.match_t, self.match_valid = self.matches.t, self.matches.valid
+            found = follow(self.matches, self.lane_points, pose, values["lane"], self.lane_count)
+            self.match_t, self.match_normal = found.t, found.normal_px
+            self.match_valid = found.valid
         at_rest = self._narrow(values)
         rescaled = self.prior.rescaled(values["drift"], self.prior_scale)
         moved = (rescaled / self.prior_scale).log().abs() > _SCALE_RESTS
         # Within that they stay as they are, to the last digit: the cost is to fall from step to step.
         self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))
-        self.is_refreshed = True
+        self.refreshed.fill_(True)
         return at_rest and not bool(moved.any())
 
     @torch.no_grad()
@@ -324,7 +338,7 @@ class Bundle(nn.Module):
     def problem(self) -> Problem:
         """The least-squares problem with the matches and scales of the moment, lanes held where they are.
 
-        Of a bundle that was never refreshed, or not since it was loaded, they are found first.
+        Of a bundle that was never refreshed they are found first.
         """
         return Problem(self.variables, {**self._terms(self.prior_scale), **self._slide_term()})
 
@@ -342,7 +356,7 @@ class Bundle(nn.Module):
         return Problem(self.variables, terms)
 
     def _terms(self, prior_scale: Float[Tensor, "j 3"]) -> dict[str, CostTerm]:
-        if not self.is_refreshed:
+        if not bool(self.refreshed):
             self.refresh()
         terms = {**self.prior.terms(prior_scale), **self.fixed}
         terms.update(self._size_term())
@@ -435,9 +449,3 @@ class Bundle(nn.Module):
             lane.lane_height_jacobian,
         )
         return {"lane_reprojection": image, "lane_height": height}
-
-
-def _forget_refresh(bundle: nn.Module, _: object) -> None:
-    """What was loaded has matches and scales of its own."""
-    assert isinstance(bundle, Bundle)
-    bundle.is_refreshed = False

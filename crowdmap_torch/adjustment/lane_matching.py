@@ -63,7 +63,7 @@ def sample_parameters(
     length = point.new_zeros(len(lanes)).index_add_(0, piece[:-1], chord)
     samples = (length / spacing).ceil().long().clamp_min(1) + 1
     of, rank = spline_basis.rows(samples)
-    return of, rank * (count[of] - 1) / (samples[of] - 1)
+    return of, rank.to(point) * (count[of] - 1) / (samples[of] - 1)
 
 
 def follow(

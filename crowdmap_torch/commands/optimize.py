@@ -20,22 +20,24 @@ import torch
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.config import MapperConfig, config_hash, dump, load_config
+from crowdmap_torch.config import MapperConfig, dump, load_config
+from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
 from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.errors import input_read
 from crowdmap_torch.io.maps import certain_part
+from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.processes.interrupts import keeping
-from crowdmap_torch.report.checkpoints import load_checkpoint, save_checkpoint
 from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.record import record_of
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.report.watch import Watch
+from crowdmap_torch.runs.checkpoint import Checkpoint, Found, inputs_of
 from crowdmap_torch.runs.folder import (
     RunFolder,
     figures_of,
@@ -45,7 +47,7 @@ from crowdmap_torch.runs.folder import (
     refuse_overlap,
 )
 from crowdmap_torch.runs.metrics import metrics_of
-from crowdmap_torch.tables import Dataset, RejectedJourney, to_device
+from crowdmap_torch.tables import Dataset, RejectedJourney, Survey, to_device
 
 EMPTY_MAP = 3
 """Exit code with `--strict` where a map was written without the signs or lanes that were detected."""
@@ -96,43 +98,51 @@ def _map(
         dataset = _load(options.dataset, device, strict=options.strict)
         survey = read_survey_of(options.dataset, dataset.origin)
         truth = read_truth_of(options.dataset, dataset, survey)
-        control = None
-        if options.control is not None:
-            control = read_survey_at(options.control, dataset.origin)
+        control = options.control and read_survey_at(options.control, dataset.origin)
+        inputs = inputs_of(dataset, config, survey, truth, control, device=device)
+        kept = Checkpoint(folder.checkpoint, inputs)
+        found = _take_up(kept, folder, len(dataset.journeys), device) if options.resume else Found()
+    if found is None:
+        return 0
     findings = look_over(options.dataset, dataset, config.positioning, config.sign_association)
     _tell(findings, dataset)
 
     progress = Progress()
     folder.prepare()
+    kept.begin()
     with TensorBoardLog(folder.tensorboard) as log:
         log.log_config(dump(config))
 
         # ---- one journey at a time (section IV) ----
         journeys = dataset.journeys
-        maps = mapper.map_journeys(journeys, config, workers=options.workers, progress=progress)
+        maps = mapper.map_journeys(
+            journeys,
+            config,
+            workers=options.workers,
+            progress=progress,
+            known=found.journeys,
+            keep=kept.keep_journey,
+        )
 
         # ---- landmarks of all journeys told apart, biases found (section V-A) ----
         progress("clusters and biases")
-        first = mapper.first_map(journeys, maps, config)
+        first = found.first or kept.keep_first(mapper.first_map(journeys, maps, config))
 
         # ---- everything at once (section V-B) ----
         progress("bundle adjustment: building")
-        known = None if control is None else control.signs.to(device)
-        bundle = mapper.build_bundle(journeys, maps, first, config, control=known)
-        start = 0
-        if options.resume and folder.checkpoint.exists():
-            with input_read():
-                saved = load_checkpoint(folder.checkpoint, bundle, config_hash=config_hash(config))
-            start = saved.iteration
-        state = begun = adjust.start(bundle)
+        pins = None if control is None else control.signs.to(device)
+        bundle = mapper.build_bundle(journeys, maps, first, config, control=pins)
         watch = Watch(log, survey, first.signs, first.lanes, every=options.log_every)
-        watch.start(bundle, mapper.clusters_map(dataset, first))
-        most = config.adjust.lm.max_iterations
-        for iteration, state in adjust.steps(bundle, begun, first=start):
+        if found.step is None:
+            begun = adjust.start(bundle)
+            kept.keep_start(watch.start(bundle, mapper.clusters_map(dataset, first)))
+        else:
+            begun = adjust.go_on(bundle, found.step.standing)
+            watch.go_on(found.start, found.step.course)
+        state, most = begun, config.adjust.lm.max_iterations
+        for iteration, state in adjust.steps(bundle, begun, first=found.steps):
             watch.step(iteration, state, bundle)
-            save_checkpoint(
-                folder.checkpoint, bundle, config_hash=config_hash(config), iteration=iteration + 1
-            )
+            kept.keep_step(adjust.standing(bundle, state, iteration + 1), watch.course)
             progress("bundle adjustment", iteration + 1, most, f"cost {float(state.cost):.1f}")
 
         # ---- the map ----
@@ -146,16 +156,9 @@ def _map(
     # ---- its errors against the survey, the report ----
     with folder.publishing():
         progress("errors and report")
-        figures = figures_before = None
-        if survey is not None:
-            final, before = (
-                certain_part(m, config.min_confidence) for m in (result.hd_map, result.map_clusters)
-            )
-            figures = figures_of(final, survey, truth, folder.unfinished, control)
-            figures_before = figures_of(before, survey, truth, None, control)
-            print(format_figures(figures))
+        compared = _compared(result, config, survey, truth, folder, control)
         progress.finish()
-        seconds, compared = progress.seconds, (figures, figures_before)
+        seconds = progress.seconds
         missing = missing_findings(dataset, result, config)
         _tell(missing, dataset)
         warnings = (*findings, *missing)
@@ -165,6 +168,7 @@ def _map(
             dataset, result, config, watch, seconds, survey, truth, *compared, warnings
         )
         write_report(folder.unfinished / folder.report.name, record)
+    kept.finish()
     print(f"map: {folder.map}")
     print(f"report: {folder.report}")
     return EMPTY_MAP if options.strict and missing else 0
@@ -189,6 +193,38 @@ def _tell_rejected(rejected: Sequence[RejectedJourney]) -> None:
 def _tell(findings: Sequence[Finding], dataset: Dataset) -> None:
     for finding in findings:
         print(f"looks wrong: {finding.line(len(dataset.journeys))}", file=sys.stderr)
+
+
+def _take_up(
+    kept: Checkpoint, folder: RunFolder, journeys: int, device: torch.device
+) -> Found | None:
+    """What an interrupted run had finished, said in a line; None if it was not interrupted."""
+    if kept.is_finished(folder.map):
+        print(f"finished already: {folder.map}")
+        return None
+    found = kept.found(journeys, device=device)
+    for line in found.lines(journeys):
+        print(f"resuming: {line}", file=sys.stderr)
+    return found
+
+
+def _compared(
+    result: mapper.MapResult,
+    config: MapperConfig,
+    survey: Survey | None,
+    truth: Truth | None,
+    folder: RunFolder,
+    control: Survey | None,
+) -> tuple[MapFigures | None, MapFigures | None]:
+    """Figures of the map, which are printed, and of that of the cluster heads, where there is a survey."""
+    if survey is None:
+        return None, None
+    final, before = (
+        certain_part(m, config.min_confidence) for m in (result.hd_map, result.map_clusters)
+    )
+    figures = figures_of(final, survey, truth, folder.unfinished, control)
+    print(format_figures(figures))
+    return figures, figures_of(before, survey, truth, None, control)
 
 
 def _device(name: str) -> torch.device:

@@ -1,1 +1,1 @@
-"""What people look at: TensorBoard, plots, report.html; and checkpoints."""
+"""What people look at: TensorBoard, plots, report.html."""

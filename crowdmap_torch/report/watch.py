@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -17,6 +20,20 @@ from crowdmap_torch.tables import HdMap, Lanes, Signs, Survey
 
 _LANES_EVERY = 5
 """Lanes are compared with the survey every this many steps: it takes longer than a step."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Lengths of pixel residuals."""
+
+    by_stage: Mapping[str, Float[Tensor, " _"]]
+
+
+@dataclass(frozen=True)
+class Course:
+    """The steps of an adjustment, as they were watched."""
+
+    iterations: tuple[Iteration, ...]
 
 
 class Watch:
@@ -40,12 +57,23 @@ class Watch:
         self._every = max(every, 1)
 
     @torch.no_grad()
-    def start(self, bundle: Bundle, map_before: HdMap) -> None:
+    def start(self, bundle: Bundle, map_before: HdMap) -> Residuals:
         """The map of the cluster heads and its residuals, before the first step."""
         self._log.log_map("map/before", map_before, self._survey, 0)
         self.residual_px["cluster heads"] = pixel_residuals(bundle)
         errors = self._errors(bundle, with_lanes=True)
         self._log.log_scalars(errors, 0)
+        return Residuals(self.residual_px)
+
+    @property
+    def course(self) -> Course:
+        """The steps up to now."""
+        return Course(tuple(self.iterations))
+
+    def go_on(self, residuals: Residuals, course: Course) -> None:
+        """Takes over what another watch saw, up to where it was interrupted."""
+        self.residual_px = dict(residuals.by_stage)
+        self.iterations = list(course.iterations)
 
     @torch.no_grad()
     def step(self, number: int, state: LmState, bundle: Bundle) -> None:

@@ -73,7 +73,7 @@ class RunFolder:
         self.resume = resume
         self.map = path / "map"
         self.report = path / "report.html"
-        self.checkpoint = path / "checkpoint.pt"
+        self.checkpoint = path / "checkpoint"
         self.unfinished = path / "unfinished"
         self.tensorboard = self.unfinished / "tensorboard"
         self._older = self.unfinished / "older"
@@ -109,7 +109,7 @@ class RunFolder:
         write_json(self.path / "run.json", {"format": _FORMAT, "version": 1})
         if not self.resume:
             shutil.rmtree(self.unfinished, ignore_errors=True)
-            self.checkpoint.unlink(missing_ok=True)
+            shutil.rmtree(self.checkpoint, ignore_errors=True)
         self.unfinished.mkdir(exist_ok=True)
 
     def kept(self) -> str:

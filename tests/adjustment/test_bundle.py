@@ -43,11 +43,15 @@ def test_asking_again_changes_nothing(build: Callable[[], Bundle]):
     assert costs(bundle) == costs(bundle)
 
 
-def test_a_bundle_that_was_loaded_finds_its_matches_first(build: Callable[[], Bundle]):
+def test_a_bundle_that_was_loaded_has_the_matches_and_scales_of_the_other(
+    build: Callable[[], Bundle],
+):
     saved, loaded = build(), build()
     saved.refresh()
+    found = costs(saved)
     loaded.problem()
     loaded.load_state_dict(saved.state_dict())
-    assert not loaded.is_refreshed
+    assert costs(loaded) == found
     saved.refresh()
+    loaded.refresh()
     assert costs(loaded) == costs(saved)

@@ -9,8 +9,10 @@ import shutil
 import signal
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +29,7 @@ from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.cli import main
 from crowdmap_torch.commands import optimize as optimize_command
 from crowdmap_torch.config import MapperConfig, load_config
-from crowdmap_torch.io.maps import certain_part, read_map
+from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.runs.folder import RunFolder
 from crowdmap_torch.tables import Dataset
 
@@ -249,49 +251,138 @@ class Interruption(Exception):
     """What stops a run in the middle."""
 
 
-def interrupt_at(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
-    step, taken = adjust.adjust_step, []
+class Cuts:
+    """Counts the calls of the stages, and ends a run before one of them."""
 
-    def limited(*arguments):
-        if len(taken) == iteration:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, maps: tuple[mapper.JourneyMap, ...]
+    ) -> None:
+        self.calls: Counter[str] = Counter()
+        self.cut: tuple[str, int] | None = None
+        single = lambda journey, number, config: maps[number]  # noqa: E731
+        for place, name, stage in (
+            (mapper, "map_journey", single),
+            (mapper, "first_map", mapper.first_map),
+            (adjust, "adjust_step", adjust.adjust_step),
+            (mapper, "finish_map", mapper.finish_map),
+            (optimize_command, "metrics_of", optimize_command.metrics_of),
+        ):
+            monkeypatch.setattr(place, name, partial(self._call, name, stage))
+
+    def _call(self, name: str, stage: Callable, *arguments, **options):
+        if self.cut == (name, self.calls[name]):
             raise Interruption
-        taken.append(1)
-        return step(*arguments)
-
-    monkeypatch.setattr(adjust, "adjust_step", limited)
+        self.calls[name] += 1
+        return stage(*arguments, **options)
 
 
-def test_an_interrupted_run_goes_on_where_it_was(
-    optimize,
-    quick,
-    tiny_folder: Path,
-    tmp_path: Path,
-    tiny_result: mapper.MapResult,
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.fixture
+def cuts(monkeypatch: pytest.MonkeyPatch, tiny_result: mapper.MapResult) -> Cuts:
+    """Each journey's own map is in memory, and no report is drawn."""
+    monkeypatch.setattr(optimize_command, "write_report", lambda path, record: path.touch())
+    return Cuts(monkeypatch, tiny_result.journey_maps)
+
+
+def same_map(one: Path, other: Path) -> bool:
+    """Whether the maps of two runs are the same to the last bit, but for when they were made."""
+    heads = [json.loads((run / "map" / "map.json").read_text()) for run in (one, other)]
+    for head in heads:
+        del head["provenance"]["created_at"]
+    files = [{p.name: p.read_bytes() for p in (r / "map").glob("*.parquet")} for r in (one, other)]
+    return heads[0] == heads[1] and files[0] == files[1]
+
+
+def test_a_run_cut_again_and_again_repeats_nothing_and_ends_with_the_same_bits(
+    optimize, cuts: Cuts, tiny_folder: Path, tmp_path: Path, run: Path
+):
+    out, steps = tmp_path / "run", len(json.loads((run / "metrics.json").read_text())["costs"])
+    for cut, found in (
+        (("map_journey", 1), None),
+        (("first_map", 0), "1 of 3 journeys"),
+        (("adjust_step", 0), "3 of 3 journeys"),
+        (("adjust_step", 2), "3 of 3 journeys, clusters and biases"),
+        (("adjust_step", steps - 1), "3 of 3 journeys, clusters and biases, step 2"),
+        (("finish_map", 0), f"3 of 3 journeys, clusters and biases, step {steps - 1}"),
+        # The map is there, but not the run.
+        (("metrics_of", 0), f"3 of 3 journeys, clusters and biases, step {steps}"),
+        (None, f"3 of 3 journeys, clusters and biases, step {steps}"),
+    ):
+        cuts.cut = cut
+        options = () if found is None else ("--resume",)
+        if cut is not None:
+            with pytest.raises(Interruption):
+                optimize(tiny_folder, out, *options)
+            assert (out / "checkpoint" / "inputs.json").exists()
+            continue
+        said = optimize(tiny_folder, out, *options)
+        assert said.code == 0 and f"resuming: {found}\n" in said.err
+    assert cuts.calls == {
+        **{"map_journey": 3, "first_map": 1, "adjust_step": steps},
+        # Begun again by the last one, which did not know that it was finished.
+        **{"finish_map": 2, "metrics_of": 1},
+    }
+    assert same_map(out, run)
+    resumed, whole = (json.loads((r / "metrics.json").read_text()) for r in (out, run))
+    for name in ("costs", "outcome", "counts", "journeys", "survey"):
+        assert resumed[name] == whole[name]
+    # What is left is small, and says that there is nothing more to do.
+    assert [p.name for p in (out / "checkpoint").rglob("*")] == ["inputs.json"]
+    said = optimize(tiny_folder, out, "--resume")
+    assert said.code == 0 and said.out == f"finished already: {out / 'map'}\n"
+
+
+def test_a_run_does_not_go_on_with_something_else(
+    optimize, cuts: Cuts, copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ):
     out, other = tmp_path / "run", tmp_path / "other.yaml"
-    with monkeypatch.context() as patch:
-        interrupt_at(patch, 2)
-        with pytest.raises(Interruption):
-            optimize(tiny_folder, out)
-    assert (out / "checkpoint.pt").exists() and not (out / "map").exists()
+    cuts.cut = ("adjust_step", 1)
+    with pytest.raises(Interruption):
+        optimize(copy, out)
+    before, cuts.cut = dict(cuts.calls), None
+    capsys.readouterr()
+    files = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
-    # Not with another configuration.
     other.write_text("adjust: {tukey_c: 4.0}")
-    said = optimize(tiny_folder, out, "--resume", "--config", str(other))
-    assert said.code == 2 and said.err.splitlines()[-1].startswith("crowdmap optimize: ")
-    assert "configuration" in said.err and "--overwrite" in said.err
+    said = optimize(copy, out, "--resume", "--config", str(other))
+    assert said.code == 2 and len(said.err.splitlines()) == 1
+    assert "configuration adjust.tukey_c was 4.685, is 4.0" in said.err
+    assert "--overwrite" in said.err
 
+    path = journeys_of(copy)[1] / "poses.parquet"
+    table = pq.read_table(path)
+    x = table["x"].to_numpy().copy()
+    x[3] += 1e-9
+    pq.write_table(table.set_column(table.column_names.index("x"), "x", pa.array(x)), path)
+    said = optimize(copy, out, "--resume")
+    assert said.code == 2 and len(said.err.splitlines()) == 1
+    assert "journey journey-001 has changed" in said.err
+
+    shutil.rmtree(journeys_of(copy)[1])
+    said = optimize(copy, out, "--resume")
+    assert said.code == 2 and "journey journey-001 is not there any more" in said.err
+
+    # All before any work, and nothing was touched.
+    assert cuts.calls == before
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == files
+
+
+def test_a_damaged_stage_is_made_anew(
+    optimize, cuts: Cuts, tiny_folder: Path, tmp_path: Path, run: Path
+):
+    out = tmp_path / "run"
+    cuts.cut = ("finish_map", 0)
+    with pytest.raises(Interruption):
+        optimize(tiny_folder, out)
+    cuts.cut = None
+    damaged = [out / "checkpoint" / "journeys" / "00002.pt", out / "checkpoint" / "first_map.pt"]
+    for path in damaged:
+        path.write_bytes(path.read_bytes()[:-7])
     said = optimize(tiny_folder, out, "--resume")
-    assert said.code == 0
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["costs"][0]["iteration"] == 3
-    assert metrics["outcome"].startswith("converged")
-    whole = certain_part(tiny_result.hd_map, 0.5)
-    resumed = read_map(out / "map")
-    assert resumed.sign_id == whole.sign_id
-    # Lanes are matched anew from where they began: both stop within a thousandth of the cost.
-    assert (resumed.signs.corners_world - whole.signs.corners_world).abs().max() < 5e-3
+    assert said.code == 0 and cuts.calls["map_journey"] == 4 and cuts.calls["first_map"] == 2
+    for path in damaged:
+        assert f"resuming: {path}: is cut off" in said.err
+    assert "resuming: 2 of 3 journeys, step " in said.err
+    assert same_map(out, run)
 
 
 def test_overwrite_replaces_a_run(optimize, quick, run: Path, copy: Path, tmp_path: Path):
@@ -309,11 +400,11 @@ def test_overwrite_replaces_a_run(optimize, quick, run: Path, copy: Path, tmp_pa
 
 
 def test_an_older_map_stays_while_the_new_one_is_not_complete(
-    optimize, quick, run: Path, tiny_folder: Path, tmp_path: Path, monkeypatch
+    optimize, cuts: Cuts, run: Path, tiny_folder: Path, tmp_path: Path
 ):
     out = Path(shutil.copytree(run, tmp_path / "run"))
     before = {p: p.read_bytes() for p in (out / "map").iterdir()}
-    interrupt_at(monkeypatch, 1)
+    cuts.cut = ("adjust_step", 1)
     with pytest.raises(Interruption):
         optimize(tiny_folder, out, "--overwrite")
     assert {p: p.read_bytes() for p in (out / "map").iterdir()} == before

@@ -31,7 +31,7 @@ def write_older(run: Path) -> dict[str, bytes]:
 def files_of(run: Path) -> dict[str, bytes]:
     """Every file by its name in the folder, but the marker and what a run goes on from."""
     files = {str(p.relative_to(run)): p.read_bytes() for p in run.rglob("*") if p.is_file()}
-    return {k: v for k, v in files.items() if k not in ("run.json", "checkpoint.pt")}
+    return {k: v for k, v in files.items() if k != "run.json" and not k.startswith("checkpoint/")}
 
 
 def write_newer(run: RunFolder, names: tuple[str, ...]) -> None:
@@ -120,7 +120,7 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path: Path):
 def test_only_a_run_that_goes_on_keeps_its_events_and_checkpoint(tmp_path: Path, resume: bool):
     before = write_older(tmp_path)
     run = RunFolder(tmp_path, overwrite=not resume, resume=resume)
-    for path in (run.tensorboard / "events", run.checkpoint):
+    for path in (run.tensorboard / "events", run.checkpoint / "step.pt"):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     with run.claimed():
