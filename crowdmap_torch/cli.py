@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 
 from crowdmap_torch import __version__
-from crowdmap_torch.commands.subcommands import add_subcommands
+from crowdmap_torch.commands.subcommands import OneLineParser, add_subcommands
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.processes.interrupts import Interruptible, kept
 from crowdmap_torch.processes.streams import StandardStreams
@@ -33,9 +33,7 @@ _OUTPUT_UNREAD = 128 + 13
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Reads the command line, runs the subcommand, and returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="crowdmap", description="Many ordinary drives in, one map out."
-    )
+    parser = OneLineParser(prog="crowdmap", description="Many ordinary drives in, one map out.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     add_subcommands(parser, "crowdmap_torch.commands", COMMANDS)
     options = argparse.Namespace(prog="crowdmap")

@@ -19,8 +19,11 @@ from crowdmap_torch.crowd_lanes.cluster import LaneClusterConfig
 from crowdmap_torch.crowd_lanes.join import LaneJoinConfig
 from crowdmap_torch.crowd_signs.complete_tracks import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.register import CrowdConfig
+from crowdmap_torch.io.budget import ReadingBudget
+from crowdmap_torch.io.documents import read_yaml_content
 from crowdmap_torch.lanes.reconstruct import LaneConfig
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import Seed, Settings, Share, shown
 from crowdmap_torch.residuals.sign_prior import SignHabit
 from crowdmap_torch.road.estimate import RoadConfig
 from crowdmap_torch.signs.triangulate import SignTriangulationConfig
@@ -34,7 +37,7 @@ METHODS = ("joint", "paper2017")
 
 
 @dataclass(frozen=True)
-class MapperConfig:
+class MapperConfig(Settings):
     """Everything that can be set; a YAML file names only what differs from the defaults."""
 
     method: str = "joint"
@@ -66,13 +69,16 @@ class MapperConfig:
     """V-B: bundle adjustment."""
     control: ControlConfig = field(default_factory=ControlConfig)
     """Surveyed signs that pin the map: which of the map's they are."""
-    seed: int = 0
+    seed: Seed = 0
     """Of k-means; the same seed and data give the same map."""
-    min_confidence: float = 0.5
+    min_confidence: Share = 0.5
     """Signs below this go to tentative_signs.parquet."""
+    reading: ReadingBudget = field(default_factory=ReadingBudget)
+    """The most that one file of the dataset may ask for."""
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 
@@ -105,12 +111,7 @@ def load_config(path: Path | str | None) -> MapperConfig:
     if path is None:
         return MapperConfig()
     path = Path(path)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror}); name a YAML file") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
+    content = read_yaml_content(path)
     return changed(MapperConfig(), {} if content is None else content, where=str(path))
 
 
@@ -120,14 +121,14 @@ def changed(default: Config, content: Any, *, where: str) -> Config:
     An unknown key or a value of the wrong type is a ValueError.
     """
     if not isinstance(content, Mapping):
-        raise ValueError(f"{where}: expected keys and values, found {content!r}")
+        raise ValueError(f"{where}: expected keys and values, found {shown(content)}")
     known = {f.name for f in fields(default)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(type(default))
     given = {}
     for key, value in content.items():
         if key not in known:
             raise ValueError(
-                f"{where}: unknown key {key!r}; expected one of {', '.join(sorted(known))}"
+                f"{where}: unknown key {shown(key)}; expected one of {', '.join(sorted(known))}"
             )
         here = f"{where}: {key}"
         # A stage may start from other defaults than those of the class of its field: they stay.
@@ -167,7 +168,7 @@ def _value(hint: Any, value: Any, *, where: str) -> Any:
         return _value(next(a for a in arguments if a is not type(None)), value, where=where)
     if origin is tuple:
         if not isinstance(value, list):
-            raise ValueError(f"{where}: expected a list, found {value!r}")
+            raise ValueError(f"{where}: expected a list, found {shown(value)}")
         endless = len(arguments) == 2 and arguments[1] is Ellipsis
         kinds = [arguments[0]] * len(value) if endless else list(arguments)
         if len(kinds) != len(value):
@@ -177,13 +178,10 @@ def _value(hint: Any, value: Any, *, where: str) -> Any:
             for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
         )
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    # YAML reads 1e-6 (without a dot) as text.
-    if hint is float and isinstance(value, str):
         try:
             return float(value)
-        except ValueError:
-            pass
+        except OverflowError:
+            raise ValueError(f"{where}: expected a number, found {shown(value)}") from None
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        raise ValueError(f"{where}: expected {hint.__name__}, found {value!r}")
+        raise ValueError(f"{where}: expected {hint.__name__}, found {shown(value)}")
     return value

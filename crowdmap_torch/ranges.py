@@ -40,34 +40,66 @@ class Range:
 
 @dataclass(frozen=True)
 class Rising:
-    """Several numbers of which each is above the one before."""
+    """Several numbers of which none is below the one before."""
 
     def fault(self, values: tuple[float, ...]) -> str | None:
         """What was expected, if they do not rise."""
-        if all(a < b for a, b in pairwise(values)):
+        if all(a <= b for a, b in pairwise(values)):
             return None
-        return f"expected numbers that rise, found {shown(values)}"
+        return f"expected numbers of which none is below the one before, found {shown(values)}"
 
 
-RISING = Rising()
+@dataclass(frozen=True)
+class Filled:
+    """One number at least."""
+
+    def fault(self, values: tuple[Any, ...]) -> str | None:
+        """What was expected, if there is none."""
+        return None if values else "expected one number at least, found none"
+
+
+RISING, FILLED = Rising(), Filled()
 
 # ---- kinds of quantities: what a field's annotation names ----
 Length = Annotated[float, Range(1e-3, 1e6, "metres: a millimetre to 1,000 km")]
 LengthOrNone = Annotated[float, Range(0, 1e6, "metres: none to 1,000 km")]
-Sigma = Annotated[float, Range(1e-6, 1e6, "a spread: its inverse square must be a finite weight")]
+Offset = Annotated[float, Range(-1e6, 1e6, "metres to either side, 1,000 km at most")]
+Spacing = Annotated[float, Range(0.01, 1e6, "metres apart: what is closer fills the memory")]
+Sigma = Annotated[float, Range(1e-9, 1e6, "a spread: its inverse square must be a finite weight")]
+SigmaOrNone = Annotated[float, Range(0, 1e6, "a spread that others are added to, or none")]
 SigmaOrOff = Annotated[
-    float, Range(1e-6, 1e6, "a spread; infinity switches the term off", or_infinite=True)
+    float, Range(1e-9, 1e6, "a spread; without end it switches the term off", or_infinite=True)
 ]
+Deviations = Annotated[float, Range(0.5, 1e12, "standard deviations: below, good measurements go")]
 Pixels = Annotated[float, Range(1e-3, 1e5, "pixels: no image has more, no detector is finer")]
+PixelsOrNone = Annotated[float, Range(0, 1e5, "pixels: no image has more")]
+Focal = Annotated[float, Range(10, 1e5, "pixels: from a fisheye to a telescope")]
+Side = Annotated[int, Range(16, 32_768, "pixels of an image's side")]
+Place = Annotated[float, Range(-100, 100, "a place on the plane one metre ahead of a camera")]
 Degrees = Annotated[float, Range(0, 360, "degrees: no more than a turn")]
+Angle = Annotated[float, Range(-360, 360, "degrees to either side: no more than a turn")]
 Radians = Annotated[float, Range(0, 2 * math.pi, "radians: no more than a turn")]
-Seconds = Annotated[float, Range(1e-6, 1e7, "seconds: a microsecond to some months")]
+Seconds = Annotated[float, Range(0, 1e7, "seconds: none to some months")]
+Duration = Annotated[float, Range(1e-6, 1e7, "seconds: something divides by them")]
+FrameRate = Annotated[
+    float, Range(0.1, 1000, "frames a second: a slide show to a slow-motion camera")
+]
+Speed = Annotated[float, Range(0.01, 150, "metres a second, or of change in one: what cars do")]
+Rate = Annotated[float, Range(0, 1000, "how often in a kilometre or frame: none to everywhere")]
 Share = Annotated[float, Range(0, 1, "a share or a probability")]
 Cost = Annotated[float, Range(0, 1e9, "a cost beside squared residuals of some units")]
 Factor = Annotated[float, Range(1e-6, 1e6, "a ratio of like things")]
-Multiple = Annotated[float, Range(1e-2, 1e6, "a multiple of a spread or scale")]
-Count = Annotated[int, Range(1, 10**7, "how many, one at least, and no more than memory holds")]
-CountOrNone = Annotated[int, Range(0, 10**7, "how many, and no more than memory holds")]
+Freedom = Annotated[float, Range(1, 1e9, "degrees of freedom: with less nothing has a variance")]
+Damping = Annotated[float, Range(1e-30, 1e30, "beside a diagonal of one: what float64 still adds")]
+Count = Annotated[int, Range(1, 10**7, "how many: one at least, and no more than memory holds")]
+CountOrNone = Annotated[int, Range(0, 10**7, "how many: no more than memory holds")]
+Workers = Annotated[int, Range(1, 4096, "processes or threads: one at least")]
+Rounds = Annotated[int, Range(1, 100_000, "how often: once at least, and an end is wanted")]
+RoundsOrNone = Annotated[int, Range(0, 100_000, "how often: an end is wanted")]
+Span = Annotated[tuple[Length, Length], RISING]
+SecondsSpan = Annotated[tuple[Seconds, Seconds], RISING]
+PixelsSpan = Annotated[tuple[PixelsOrNone, PixelsOrNone], RISING]
+CountSpan = Annotated[tuple[CountOrNone, CountOrNone], RISING]
 Seed = Annotated[int, Range(0, 2**63 - 1, "a seed has 63 bits")]
 
 
@@ -121,7 +153,7 @@ def _fault(hint: Any, value: Any) -> str | None:
         kind, *rules = typing.get_args(hint)
         if fault := _fault(kind, value):
             return fault
-        faults = (rule.fault(value) for rule in rules if isinstance(rule, Range | Rising))
+        faults = (rule.fault(value) for rule in rules if isinstance(rule, Range | Rising | Filled))
         return next((f": {fault}" for fault in faults if fault), None)
     if origin in (typing.Union, types.UnionType):
         kinds = typing.get_args(hint)

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 
 from crowdmap_torch.config import MapperConfig, as_dict, config_hash, dump, load_config
+from crowdmap_torch.ranges import Range, hints
 
 ROOT = Path(__file__).parent.parent
 
@@ -55,8 +58,22 @@ def test_a_file_changes_what_it_names_and_nothing_else(load):
         ("lane_association: {reach_m: [2.0, far]}", ["reach_m[1]", "expected float", "'far'"]),
         ("method: best", ["method", "joint", "paper2017", "'best'"]),
         ("crowd: {method: best}", ["crowd", "method", "'best'"]),
-        ("seed: [1, 2", ["is not YAML"]),
-        ("seed: 1\n\tadjust: 2", ["is not YAML"]),
+        ("seed: [1, 2", ["cannot be read as YAML"]),
+        ("seed: 1\n\tadjust: 2", ["cannot be read as YAML"]),
+        ("seed: " + "9" * 5000, ["cannot be read as YAML"]),
+        ("seed: 0x" + "f" * 5000, ["seed", "expected 0 to", "thousands of digits"]),
+        ("seed: -1", ["seed", "expected 0 to", "-1"]),
+        ("adjust: {sign_sigma_px: -3}", ["adjust: sign_sigma_px", "0.001 to", "pixels", "-3"]),
+        ("adjust: {tukey_c: 0}", ["adjust: tukey_c", "expected 0.5 to", "found 0"]),
+        ("adjust: {tukey_c: 1e300}", ["adjust: tukey_c", "expected 0.5 to", "found 1e+300"]),
+        ("adjust: {tukey_c: .nan}", ["adjust: tukey_c", "found nan"]),
+        ("adjust: {lm: {max_iterations: 100000000}}", ["adjust: lm: max_iterations", "an end"]),
+        ("min_confidence: .inf", ["min_confidence", "found inf"]),
+        ("min_confidence: 1.5", ["min_confidence", "expected 0 to 1", "a share"]),
+        ("lane_association: {reach_m: [40, 2]}", ["reach_m", "none is below the one before"]),
+        ("crowd: {shift_sigmas_m: []}", ["shift_sigmas_m", "expected one number at least"]),
+        ("lane_join: {bandwidths_m: [0.6, -0.2]}", ["bandwidths_m[1]", "found -0.2"]),
+        ("seed: 1\nseed: 2", ["'seed' is given twice"]),
     ],
 )
 def test_mistakes_are_one_line_that_names_file_key_and_rule(load, text: str, words: list[str]):
@@ -68,14 +85,14 @@ def test_mistakes_are_one_line_that_names_file_key_and_rule(load, text: str, wor
 
 
 def test_a_missing_file_is_one_line(tmp_path: Path):
-    with pytest.raises(ValueError, match=r"none\.yaml: cannot be read \(No such file"):
+    with pytest.raises(ValueError, match=r"none\.yaml: the file is missing"):
         load_config(tmp_path / "none.yaml")
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path):
     path = tmp_path / "some.yaml"
     path.write_bytes(b"\xff\xfe\x00seed")
-    with pytest.raises(ValueError, match="is not YAML"):
+    with pytest.raises(ValueError, match="is no UTF-8 text"):
         load_config(path)
 
 
@@ -140,3 +157,50 @@ def test_our_method_leaves_the_stages_alone():
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)
 def test_every_configuration_of_the_repository_can_be_read(path: Path):
     assert load_config(path) != MapperConfig()
+
+
+def numbers_of(config: Any, way: str = "") -> Iterator[tuple[Any, str, str, Any]]:
+    """Every field of a configuration that holds numbers: what it is in, its name, its way there, its annotation."""
+    for field in fields(config):
+        value, name = getattr(config, field.name), f"{way}{field.name}"
+        if is_dataclass(value):
+            yield from numbers_of(value, f"{name}.")
+        elif not isinstance(value, str | bool):
+            yield config, field.name, name, hints(type(config))[field.name]
+
+
+def ranges_in(hint: Any) -> list[Range]:
+    """The ranges of an annotation, those inside tuples too."""
+    inside = [r for argument in get_args(hint) for r in ranges_in(argument)]
+    return inside + [r for r in getattr(hint, "__metadata__", ()) if isinstance(r, Range)]
+
+
+def instead(value: Any, number: float) -> Any:
+    """A field's value with a number for each of its own."""
+    if isinstance(value, tuple):
+        return tuple(instead(item, number) for item in value) or (number,)
+    return number
+
+
+NUMBERS = {name: (inside, field, hint) for inside, field, name, hint in numbers_of(MapperConfig())}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_every_number_has_a_range_with_a_reason_and_holds_to_it(name: str):
+    inside, field, hint = NUMBERS[name]
+    ranges = ranges_in(hint)
+    assert ranges and all(r.why and math.isfinite(r.low) and math.isfinite(r.high) for r in ranges)
+    value = getattr(inside, field)
+    # The default lies inside: replacing it by itself is no error.
+    replace(inside, **{field: value})
+    beyond = (math.nan, -math.inf, 10 * ranges[0].high + 1, ranges[0].low - 1)
+    for number in (*beyond, *(() if ranges[0].or_infinite else (math.inf,))):
+        with pytest.raises(ValueError, match=field):
+            replace(inside, **{field: instead(value, number)})
+
+
+def test_what_is_no_configuration_is_refused_from_python_too():
+    with pytest.raises(ValueError, match="adjust: expected AdjustConfig"):
+        MapperConfig(adjust={"tukey_c": 5.0})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"seed: expected a whole number, found 1\.5"):
+        MapperConfig(seed=1.5)  # type: ignore[arg-type]

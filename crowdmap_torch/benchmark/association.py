@@ -17,6 +17,7 @@ from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.truth import SignAssociations
 from crowdmap_torch.mapper import build_map
+from crowdmap_torch.ranges import Workers, argument
 from crowdmap_torch.runs.folder import read_survey_of, read_truth_of
 from crowdmap_torch.tables import Association, Dataset
 
@@ -92,7 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Which datasets."""
     parser.add_argument("datasets", type=Path, nargs="+", metavar="DATASET", help="simulated ones")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--workers", type=int, default=1, help="journeys mapped at a time")
+    parser.add_argument(
+        "--workers", type=argument(Workers), default=1, help="journeys mapped at a time"
+    )
 
 
 def run(options: argparse.Namespace) -> None:

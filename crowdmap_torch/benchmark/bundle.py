@@ -33,6 +33,7 @@ from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.robust import Huber, Tukey
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.ranges import Rounds, Workers, argument
 
 MINIMISATION = KeptMatrixConfig(
     lm.LmConfig(max_iterations=100, cost_tolerance=1e-6, initial_damping=1e-8, max_stretch=3.0)
@@ -48,8 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--problem", type=Path, help="solve this problem alone, with ours")
     parser.add_argument("--out", type=Path, help="npz file of its result: q, p, X")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--repeats", type=int, default=3, help="runs of each; the median counts")
+    parser.add_argument("--threads", type=argument(Workers), default=2)
+    parser.add_argument(
+        "--repeats", type=argument(Rounds), default=3, help="runs of each; the median counts"
+    )
     parser.add_argument(
         "--sizes",
         nargs="+",

@@ -28,6 +28,7 @@ from crowdmap_torch.crowd_signs.register import CrowdConfig, register_crowd
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.processes.workers import Workers
+from crowdmap_torch.ranges import Count, Rounds, argument
 from crowdmap_torch.tables import Signs
 
 THREADS = 2
@@ -186,8 +187,10 @@ def pair_scores(sign: Int[Tensor, " n"], label: Int[Tensor, " n"]) -> tuple[floa
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """How many triangulations, and how often."""
-    parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 10_000, 100_000])
-    parser.add_argument("--repeats", type=int, default=3, help="runs of each; the median counts")
+    parser.add_argument("--sizes", type=argument(Count), nargs="+", default=[1000, 10_000, 100_000])
+    parser.add_argument(
+        "--repeats", type=argument(Rounds), default=3, help="runs of each; the median counts"
+    )
     parser.add_argument(
         "--spectral-limit",
         type=int,

@@ -18,6 +18,7 @@ from crowdmap_torch.config import METHODS, MapperConfig
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.mapper import map_journey, map_journeys
+from crowdmap_torch.ranges import CountOrNone, FrameRate, argument
 from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of
 from crowdmap_torch.tables import Journey
 
@@ -46,8 +47,12 @@ class StepTimes:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap benchmark journey` takes."""
     parser.add_argument("dataset", type=Path, help="folder of a dataset")
-    parser.add_argument("--journey", type=int, default=0, help="which of its journeys is driven")
-    parser.add_argument("--rate", type=float, default=15.0, help="frames a second of the camera")
+    parser.add_argument(
+        "--journey", type=argument(CountOrNone), default=0, help="which of its journeys is driven"
+    )
+    parser.add_argument(
+        "--rate", type=argument(FrameRate), default=15.0, help="frames a second of the camera"
+    )
     parser.add_argument("--device", default="cuda", help="also mapped there, if there is one")
     parser.add_argument(
         "--endless",

@@ -34,6 +34,7 @@ from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.ranges import Rounds, Workers, argument
 from crowdmap_torch.residuals.reprojection import components
 
 LM = lm.LmConfig(max_iterations=100, cost_tolerance=1e-6, initial_damping=1e-4)
@@ -166,8 +167,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `crowdmap benchmark ladybug`."""
     parser.add_argument("file", type=Path, help="problem as published, unpacked")
     parser.add_argument("--out", type=Path, help="solve with ours alone; npz file of camera, point")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--repeats", type=int, default=3, help="runs of each; the median counts")
+    parser.add_argument("--threads", type=argument(Workers), default=2)
+    parser.add_argument(
+        "--repeats", type=argument(Rounds), default=3, help="runs of each; the median counts"
+    )
     parser.add_argument(
         "--solvers", nargs="+", default=["ours", "ceres"], choices=["ours", "ceres"]
     )

@@ -20,6 +20,8 @@ from scipy.sparse.linalg import eigsh
 from sklearn.cluster import KMeans
 from torch import Tensor
 
+from crowdmap_torch.ranges import Count, RoundsOrNone, Settings, Share
+
 LABEL_METHODS = ("kmeans", "sign_code")
 
 _PADDING = 4.0
@@ -29,22 +31,23 @@ _BATCH_ELEMENTS = 1 << 23
 
 
 @dataclass(frozen=True)
-class SpectralConfig:
+class SpectralConfig(Settings):
     """How a similarity graph is cut into clusters."""
 
     labels: str = "kmeans"
     """`kmeans` on the rows of the eigenvectors, or `sign_code`: the signs of a row's entries are its cluster's code."""
-    restarts: int = 3
+    restarts: RoundsOrNone = 3
     """Further k-means runs with random seeds, beside the one started from the most orthogonal rows."""
-    dense_limit: int = 256
+    dense_limit: Count = 256
     """Components up to this many nodes are decomposed whole; above, only the leading eigenpairs are computed."""
-    leading: int = 48
+    leading: Count = 48
     """Eigenpairs computed of larger components."""
-    cut_below: float = 0.02
+    cut_below: Share = 0.02
     """A larger component is cut in two while even its last leading eigenvalue is below this: too many."""
 
     def __post_init__(self) -> None:
         """Refuses an unknown way to label."""
+        super().__post_init__()
         if self.labels not in LABEL_METHODS:
             raise ValueError(f"labels: expected one of {LABEL_METHODS}, found {self.labels!r}")
 

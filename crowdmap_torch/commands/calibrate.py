@@ -14,6 +14,7 @@ from pathlib import Path
 from crowdmap_torch.io.calibration import read_annotations, read_surveyed_points, write_rig_road
 from crowdmap_torch.io.errors import input_read
 from crowdmap_torch.io.rigs import read_camera
+from crowdmap_torch.ranges import Degrees, Pixels, argument
 from crowdmap_torch.road.calibration import CalibrationConfig, RoadCalibration, calibrate_road
 
 
@@ -25,13 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     defaults = CalibrationConfig()
     parser.add_argument(
         "--max-rms-px",
-        type=float,
+        type=argument(Pixels),
         default=defaults.max_rms_px,
         help="a picture whose points miss by more is refused",
     )
     parser.add_argument(
         "--max-spread-deg",
-        type=float,
+        type=argument(Degrees),
         default=defaults.max_spread_deg,
         help="a picture whose normal is further from the mean is refused",
     )

@@ -23,6 +23,7 @@ from crowdmap_torch.evaluation.text import format_figures
 from crowdmap_torch.io.documents import write_json
 from crowdmap_torch.io.errors import input_read
 from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.ranges import Length, argument
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", type=Path, metavar="OUT", help="write the figures here too")
     parser.add_argument(
-        "--gate", type=float, default=3.0, metavar="M", help="of sign centres [m] (default 3)"
+        "--gate",
+        type=argument(Length),
+        default=3.0,
+        metavar="M",
+        help="of sign centres [m] (default 3)",
     )
     parser.add_argument(
         "--observable", type=Path, metavar="JSON", help="lists of the ids of observable signs"

@@ -10,7 +10,8 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 # Before torch: its threads then sleep while they wait, and do not spin. On a busy machine that is several times faster.
@@ -23,14 +24,16 @@ from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.config import MapperConfig, dump, load_config
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
+from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
 from crowdmap_torch.io.documents import plain
-from crowdmap_torch.io.errors import input_read
+from crowdmap_torch.io.errors import input_read, one_line
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.processes.interrupts import keeping
+from crowdmap_torch.ranges import Count, Workers, argument
 from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
 from crowdmap_torch.report.progress import Progress
@@ -64,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
     parser.add_argument(
         "--workers",
-        type=int,
+        type=argument(Workers),
         default=os.cpu_count() or 1,
         metavar="N",
         help="journeys mapped at a time (default: one for each core)",
@@ -75,7 +78,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace what RUN holds")
     parser.add_argument("--resume", action="store_true", help="go on where RUN was interrupted")
     parser.add_argument(
-        "--log-every", type=int, default=1, metavar="N", help="errors and histograms every N steps"
+        "--log-every",
+        type=argument(Count),
+        default=1,
+        metavar="N",
+        help="errors and histograms every N steps",
     )
 
 
@@ -95,16 +102,19 @@ def _map(
     options: argparse.Namespace, folder: RunFolder, config: MapperConfig, device: torch.device
 ) -> int:
     with input_read():
-        dataset = _load(options.dataset, device, strict=options.strict)
-        survey = read_survey_of(options.dataset, dataset.origin)
-        truth = read_truth_of(options.dataset, dataset, survey)
-        control = options.control and read_survey_at(options.control, dataset.origin)
+        with reading(config.reading, inside=options.dataset):
+            dataset = _load(options.dataset, device, strict=options.strict)
+            survey = read_survey_of(options.dataset, dataset.origin)
+            truth = read_truth_of(options.dataset, dataset, survey)
+        with reading(config.reading):
+            control = _read_control(options.control, dataset)
         inputs = inputs_of(dataset, config, survey, truth, control, device=device)
         kept = Checkpoint(folder.checkpoint, inputs)
         found = _take_up(kept, folder, len(dataset.journeys), device) if options.resume else Found()
     if found is None:
         return 0
-    findings = look_over(options.dataset, dataset, config.positioning, config.sign_association)
+    with reading(config.reading):
+        findings = look_over(options.dataset, dataset, config.positioning, config.sign_association)
     _tell(findings, dataset)
 
     progress = Progress()
@@ -156,22 +166,37 @@ def _map(
     # ---- its errors against the survey, the report ----
     with folder.publishing():
         progress("errors and report")
-        compared = _compared(result, config, survey, truth, folder, control)
+        compared = None, None
+        with _spared("figures"):
+            compared = _compared(result, config, survey, truth, folder, control)
         progress.finish()
-        seconds = progress.seconds
         missing = missing_findings(dataset, result, config)
         _tell(missing, dataset)
         warnings = (*findings, *missing)
-        metrics = metrics_of(dataset, result, config, watch.iterations, seconds, *compared)
+        metrics = metrics_of(dataset, result, config, watch.iterations, progress.seconds, *compared)
         folder.write_metrics({**metrics, "warnings": plain(warnings)})
-        record = record_of(
-            dataset, result, config, watch, seconds, survey, truth, *compared, warnings
-        )
-        write_report(folder.unfinished / folder.report.name, record)
+        with _spared("report"):
+            known = (progress.seconds, survey, truth, *compared)
+            record = record_of(dataset, result, config, watch, *known, warnings=warnings)
+            write_report(folder.unfinished / folder.report.name, record)
     kept.finish()
     print(f"map: {folder.map}")
     print(f"report: {folder.report}")
     return EMPTY_MAP if options.strict and missing else 0
+
+
+@contextmanager
+def _spared(what: str) -> Iterator[None]:
+    """What scorers or the report trip over costs figures or a page, with a line, and never the map."""
+    try:
+        yield
+    except (ValueError, ArithmeticError, LookupError, RuntimeError, TypeError) as error:
+        reason = f"{type(error).__name__}: {one_line(error)}"
+        print(f"looks wrong: no {what} could be made ({reason}); the map is whole", file=sys.stderr)
+
+
+def _read_control(folder: Path | None, dataset: Dataset) -> Survey | None:
+    return None if folder is None else read_survey_at(folder, dataset.origin)
 
 
 def _load(folder: Path, device: torch.device, *, strict: bool) -> Dataset:

@@ -10,12 +10,12 @@ import ast
 import inspect
 import sys
 import time
-import types
 import typing
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 from crowdmap_torch.io.errors import input_read
+from crowdmap_torch.ranges import Count, Seed, argument, hints
 from crowdmap_torch.simulate.dataset import DETECTION_PRESETS, SimulationConfig, write_dataset
 from crowdmap_torch.simulate.faults import KINDS
 from crowdmap_torch.simulate.lane_perception import LaneDetectionConfig
@@ -43,9 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap simulate` takes."""
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the dataset")
     parser.add_argument("--world", choices=sorted(WORLD_PRESETS), default="suburb")
-    parser.add_argument("--journeys", type=int, default=25)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--world-seed", type=int, help="seed of the world alone, if not --seed")
+    parser.add_argument("--journeys", type=argument(Count), default=25)
+    parser.add_argument("--seed", type=argument(Seed), default=0)
+    parser.add_argument(
+        "--world-seed", type=argument(Seed), help="seed of the world alone, if not --seed"
+    )
     parser.add_argument("--positioning", choices=sorted(POSITIONING_PRESETS), default="paper")
     parser.add_argument("--detection", choices=sorted(DETECTION_PRESETS), default="day")
     parser.add_argument(
@@ -57,9 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replaces a dataset in OUT")
     for name, config in _GROUPS.items():
         group = parser.add_argument_group(name, inspect.getdoc(config))
-        hints, texts = typing.get_type_hints(config), _field_docstrings(config)
+        kinds, texts = hints(config), _field_docstrings(config)
         for f in fields(config):
-            if f.name == "name" or is_dataclass(hints[f.name]):
+            if f.name == "name" or is_dataclass(kinds[f.name]):
                 continue
             option = "--" + f.name.replace("_", "-")
             group.add_argument(
@@ -67,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                 dest=f"{name}.{f.name}",
                 default=None,
                 help=texts.get(f.name, "").replace("%", "%%") or None,
-                **_kind(hints[f.name]),
+                **_kind(kinds[f.name]),
             )
 
 
@@ -108,12 +110,13 @@ def _kind(hint: object) -> dict:
     """How argparse reads a field of this type."""
     if hint is bool:
         return {"action": argparse.BooleanOptionalAction}
-    if typing.get_origin(hint) is tuple:
-        kinds = typing.get_args(hint)
-        return {"type": kinds[0], "nargs": len(kinds), "metavar": ("LEAST", "MOST")}
-    if isinstance(hint, types.UnionType):
-        hint = next(kind for kind in typing.get_args(hint) if kind is not type(None))
-    return {"type": hint, "metavar": "TEXT" if hint is str else "N"}
+    if hint is str:
+        return {"metavar": "TEXT"}
+    inside = typing.get_args(hint)[0]
+    if typing.get_origin(inside) is tuple:
+        kinds = typing.get_args(inside)
+        return {"type": argument(kinds[0]), "nargs": len(kinds), "metavar": ("LEAST", "MOST")}
+    return {"type": argument(hint), "metavar": "N"}
 
 
 def _field_docstrings(config: type) -> dict[str, str]:

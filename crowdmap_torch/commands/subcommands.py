@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import importlib
 from collections.abc import Mapping
+from typing import NoReturn
+
+from crowdmap_torch.io.errors import one_line
 
 
 def add_subcommands(
@@ -24,7 +27,15 @@ def add_subcommands(
         own.module = f"{package}.{name.replace('-', '_')}"
 
 
-class ModuleParser(argparse.ArgumentParser):
+class OneLineParser(argparse.ArgumentParser):
+    """Says in one line what is wrong with a command line; `--help` shows how it is used."""
+
+    def error(self, message: str) -> NoReturn:
+        """Ends the program with exit code 2."""
+        self.exit(2, f"{self.prog}: {one_line(message)}; see {self.prog} --help\n")
+
+
+class ModuleParser(OneLineParser):
     """Asks its module for its options when it is chosen: what the others need would count as this one's memory."""
 
     module: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +19,7 @@ from crowdmap_torch.clustering.groups import (
 )
 from crowdmap_torch.clustering.spectral import SpectralConfig, cluster_graph, renumber
 from crowdmap_torch.geometry import spline_basis, spline_fit, spline_length
+from crowdmap_torch.ranges import FILLED, Count, Length, RoundsOrNone, Settings, Spacing
 from crowdmap_torch.tables import ControlPoints, Lanes
 
 SIMILARITIES = ("gaussian", "ratio")
@@ -26,28 +28,29 @@ _POINTS_AT_ONCE = 8192
 
 
 @dataclass(frozen=True)
-class LaneClusterConfig:
+class LaneClusterConfig(Settings):
     """The paper's way to group lane pieces."""
 
     similarity: str = "gaussian"
     """`gaussian`: eq:simlane. `ratio`: N / D_min."""
-    radius_m: float = 1.5
+    radius_m: Length = 1.5
     """Threshold r: sample points of two splines nearer than this run alongside each other."""
-    critical_m: tuple[float, ...] = (8.0, 16.0, 32.0)
+    critical_m: Annotated[tuple[Length, ...], FILLED] = (8.0, 16.0, 32.0)
     """Parameter d of eq:simlane, one a round; each round clusters the heads of the round before, which are longer."""
-    touch_m: float = 0.1
+    touch_m: Length = 0.1
     """Least D_min: splines that touch would be infinitely similar."""
-    knot_spacing_m: float = 8.0
+    knot_spacing_m: Spacing = 8.0
     """Distance of the control points of cluster heads."""
-    refinements: int = 3
+    refinements: RoundsOrNone = 3
     """How often the points of a cluster are moved to their nearest place on its head, and the head fitted again."""
-    min_journeys: int = 2
+    min_journeys: Count = 2
     """Clusters seen by fewer journeys are discarded and counted."""
     spectral: SpectralConfig = field(default_factory=SpectralConfig)
     """How the similarity graph is cut."""
 
     def __post_init__(self) -> None:
         """Refuses an unknown similarity."""
+        super().__post_init__()
         if self.similarity not in SIMILARITIES:
             raise ValueError(
                 f"similarity: expected one of {SIMILARITIES}, found {self.similarity!r}"

@@ -8,6 +8,7 @@ common curves are taken off before the ridges are traced a second time, sharper.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -47,6 +48,7 @@ from crowdmap_torch.crowd_lanes.trace import (
 )
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import FILLED, Factor, Length, Settings, Share, Sigma, Spacing, Span
 from crowdmap_torch.tables import LANE_TYPES, Lanes
 
 _RING_GAP = 1.0
@@ -54,26 +56,26 @@ _RING_GAP = 1.0
 
 
 @dataclass(frozen=True)
-class LaneJoinConfig:
+class LaneJoinConfig(Settings):
     """How lane pieces become the markers of the map."""
 
-    sample_spacing_m: float = 2.0
+    sample_spacing_m: Spacing = 2.0
     """Pieces are sampled this densely."""
-    few_observations: float = 10.0
+    few_observations: Factor = 10.0
     """Pieces made from fewer detections (or a quarter of the usual number, if that is less) are hardly believed."""
-    bandwidths_m: tuple[float, ...] = (0.6, 0.2)
+    bandwidths_m: Annotated[tuple[Sigma, ...], FILLED] = (0.6, 0.2)
     """Sigma of the sideways kernel of each round; journeys' offsets are estimated between rounds."""
-    gates_m: tuple[float, ...] = (1.2, 0.7)
+    gates_m: Annotated[tuple[Length, ...], FILLED] = (1.2, 0.7)
     """Samples this far beside a curve still belong to it, by round."""
-    knot_spacing_m: tuple[float, float] = (4.0, 10.0)
+    knot_spacing_m: Span = (4.0, 10.0)
     """Distance of control points in the sharpest bends and on straight roads."""
-    stray_m: tuple[float, float] = (0.8, 3.8)
+    stray_m: Span = (0.8, 3.8)
     """Two pieces of one tracklet that run this far beside each other cannot both be right: one is left out."""
-    extend_m: float = 8.0
+    extend_m: Length = 8.0
     """How far curves are extended at their ends, if samples go on."""
-    twice_within_m: float = 0.45
+    twice_within_m: Length = 0.45
     """Of two curves nearer to each other the lesser is dropped, unless ..."""
-    seen_together: float = 0.3
+    seen_together: Share = 0.3
     """... this share of its journeys saw both at once."""
     trace: TraceConfig = field(default_factory=TraceConfig)
     """What makes a marker."""
@@ -82,6 +84,7 @@ class LaneJoinConfig:
 
     def __post_init__(self) -> None:
         """Refuses rounds without a gate."""
+        super().__post_init__()
         if len(self.gates_m) != len(self.bandwidths_m) or not self.bandwidths_m:
             raise ValueError(
                 f"gates_m: expected one gate for each of the {len(self.bandwidths_m)} (at least one) "

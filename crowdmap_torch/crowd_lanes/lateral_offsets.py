@@ -13,19 +13,20 @@ from crowdmap_torch.crowd_lanes.samples import LaneSamples
 from crowdmap_torch.crowd_lanes.splines import Match, overlap
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.banded_least_squares import solve_banded
+from crowdmap_torch.ranges import Length, Rounds, Settings, Spacing
 
 
 @dataclass(frozen=True)
-class LateralOffsetConfig:
+class LateralOffsetConfig(Settings):
     """How a journey's offset may change along it."""
 
-    node_spacing_m: float = 40.0
+    node_spacing_m: Spacing = 40.0
     """Offsets are estimated this far apart, linear in between."""
-    noise_m: float = 0.3
+    noise_m: Length = 0.3
     """1-sigma of what one metre of one marker shows about the offset, neighbouring metres being alike."""
-    scale_m: float = 0.5
+    scale_m: Length = 0.5
     """Beyond this misfit a sample, and beyond twice the drift's sigma a journey's offset, is taken for an outlier's."""
-    iterations: int = 4
+    iterations: Rounds = 4
     """Rounds of reweighting."""
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.neighbours import pairs_in_radius
 from crowdmap_torch.crowd_lanes.line_samples import along_axis, left_of_axis
 from crowdmap_torch.geometry import spline_basis
+from crowdmap_torch.ranges import Cost, Degrees, Factor, Length, Settings
 
 
 @dataclass(frozen=True)
@@ -40,22 +41,22 @@ class Polylines:
 
 
 @dataclass(frozen=True)
-class LinkConfig:
+class LinkConfig(Settings):
     """Which points may follow each other."""
 
-    reach: float = 4.5
+    reach: Length = 4.5
     """Longest link [m]."""
-    sideways: float = 0.15
+    sideways: Length = 0.15
     """A follower may lie this much beside the tangent [m], ..."""
-    sideways_rate: float = 0.12
+    sideways_rate: Factor = 0.12
     """... and this much more per metre of distance."""
-    max_angle_deg: float = 20.0
+    max_angle_deg: Degrees = 20.0
     """Between the directions of neighbours."""
-    height_gate: float = 1.0
+    height_gate: Length = 1.0
     """Steps in height are no road [m]."""
-    sideways_cost: float = 4.0
+    sideways_cost: Factor = 4.0
     """A metre beside the tangent counts like this many metres ahead."""
-    weak_cost: float = 6.0
+    weak_cost: Cost = 6.0
     """How many metres farther a point must be for a weak point to be preferred."""
 
 

@@ -26,34 +26,35 @@ from crowdmap_torch.crowd_lanes.polyline_linking import (
     link_points,
     select_polylines,
 )
+from crowdmap_torch.ranges import Count, Length, Settings, Share
 from crowdmap_torch.tables import LANE_TYPES
 
 
 @dataclass(frozen=True)
-class TraceConfig:
+class TraceConfig(Settings):
     """What makes a marker."""
 
-    min_journeys: int = 2
+    min_journeys: Count = 2
     """A place of a marker must be seen by as many, or by all there are; 1 admits single-journey markers."""
-    min_share: float = 0.1
+    min_share: Share = 0.1
     """Of the journeys that saw any marker nearby, at least this share must support a place."""
-    short_m: float = 40.0
+    short_m: Length = 40.0
     """Shorter markers must be supported by more, as strayed pieces may happen to agree over a short way: ..."""
-    short_share: float = 0.8
+    short_share: Share = 0.8
     """... by this share of the journeys nearby at no length, falling to `min_share`."""
-    nearby_m: float = 8.0
+    nearby_m: Length = 8.0
     """How near is nearby."""
-    max_gap_m: float = 40.0
+    max_gap_m: Length = 40.0
     """A stretch with too little support is bridged up to this length, if some journey saw the marker there."""
-    max_blind_gap_m: float = 10.0
+    max_blind_gap_m: Length = 10.0
     """A stretch that nobody saw is bridged up to this length if its ends fit."""
-    min_length_m: float = 8.0
+    min_length_m: Length = 8.0
     """Shorter markers are dropped."""
-    type_window_m: float = 15.0
+    type_window_m: Length = 15.0
     """Votes on the type are counted this far ahead and behind."""
-    type_majority: float = 0.65
+    type_majority: Share = 0.65
     """A type changes where another one has this share of the votes."""
-    type_run_m: float = 20.0
+    type_run_m: Length = 20.0
     """A type lasts at least this long."""
     link: LinkConfig = field(default_factory=LinkConfig)
     """Who may follow whom."""

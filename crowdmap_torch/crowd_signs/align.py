@@ -17,6 +17,7 @@ from crowdmap_torch.crowd_signs.distance import mahalanobis
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.robust import Tukey
+from crowdmap_torch.ranges import Rounds, Settings, Share, Sigma, Spacing
 from crowdmap_torch.tables import Signs
 
 METHODS = ("robust", "paper2017")
@@ -28,22 +29,23 @@ _STANDS_STILL_M = 1e-3
 
 
 @dataclass(frozen=True)
-class AlignConfig:
+class AlignConfig(Settings):
     """How what a journey's poses have wrong is found."""
 
     method: str = "robust"
     """`robust`: bias, heading and slow drift, outliers down-weighted. `paper2017`: mean differences, nothing else."""
-    node_spacing_m: float = 50.0
+    node_spacing_m: Spacing = 50.0
     """Distance between the places where the drift is estimated; linear in between [m]."""
-    noise_sigma_m: float = 0.08
+    noise_sigma_m: Sigma = 0.08
     """What a sign's place has wrong beside its covariance, the bias and the drift: 1-sigma along each axis [m]."""
-    least_certainty: float = 0.05
+    least_certainty: Share = 0.05
     """Weight of signs that fit another cluster as well: they must not bend the drift towards a wrong one."""
-    sweeps: int = 6
+    sweeps: Rounds = 6
     """Most alternations between journeys' biases and the places of clusters."""
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -22,28 +23,29 @@ from crowdmap_torch.clustering.spectral import SpectralConfig, cluster_graph, re
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, mahalanobis, sign_distance
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.optim.robust import Tukey
+from crowdmap_torch.ranges import FILLED, Count, Deviations, Length, Settings
 from crowdmap_torch.tables import Signs
 
 METHODS = ("joint", "paper2017")
 
 
 @dataclass(frozen=True)
-class SignClusterConfig:
+class SignClusterConfig(Settings):
     """How triangulated signs are grouped."""
 
     method: str = "joint"
     """`joint`: distances in units of their own uncertainty, appearance counts. `paper2017`: the paper's two rounds."""
-    scales_m: tuple[float, ...] = (4.0, 1.0)
+    scales_m: Annotated[tuple[Length, ...], FILLED] = (4.0, 1.0)
     """`paper2017`: critical distance d_c of each round, coarse to fine [m]."""
-    critical_sigmas: float = 2.0
+    critical_sigmas: Deviations = 2.0
     """`joint`: critical distance d_c in standard deviations."""
-    reach: float = 4.0
+    reach: Deviations = 4.0
     """Similarities beyond this many d_c are taken for zero."""
-    neighbours_paper: int = 256
+    neighbours_paper: Count = 256
     """`paper2017`: nearest neighbours of a sign in the graph; enough for all within reach but in the densest places."""
-    neighbours: int = 48
+    neighbours: Count = 48
     """`joint`: nearest neighbours of a sign in the graph."""
-    min_signs: int = 2
+    min_signs: Count = 2
     """Clusters of fewer triangulations are discarded (the paper's singletons)."""
     spectral: SpectralConfig = field(default_factory=SpectralConfig)
     """How the graph is cut."""
@@ -52,6 +54,7 @@ class SignClusterConfig:
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 

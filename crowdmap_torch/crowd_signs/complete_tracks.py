@@ -29,41 +29,52 @@ from crowdmap_torch.crowd_signs.projections import (
 )
 from crowdmap_torch.crowd_signs.register import Crowd, CrowdConfig
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.ranges import (
+    Count,
+    Factor,
+    Length,
+    LengthOrNone,
+    Pixels,
+    Rounds,
+    Seconds,
+    Settings,
+    Share,
+)
 from crowdmap_torch.tables import Association, Journey, Signs, Tracklets
 
 
 @dataclass(frozen=True)
-class CompleteTracksConfig:
+class CompleteTracksConfig(Settings):
     """When a detection without a landmark shows a sign of the map."""
 
-    reach_m: float = 120.0
+    reach_m: LengthOrNone = 120.0
     """Signs further from the camera are not looked for [m]."""
-    candidates: int = 48
+    candidates: Count = 48
     """Signs that a detection is compared with, the nearest to its camera."""
-    error_window_s: float = 1.0
+    error_window_s: Seconds = 1.0
     """For so long before and after, a detection of a sign tells how its projection errs [s]."""
-    known_px: float = 3.0
+    known_px: Pixels = 3.0
     """Where that is known, most corners are within so many pixels ..."""
-    known_share: float = 0.1
+    known_share: Share = 0.1
     """... and this share of the outline's larger side of the projection."""
-    vote_share: float = 0.35
+    vote_share: Share = 0.35
     """Where it is not, most corners are within this share, ..."""
-    vote_clear: float = 2.0
+    vote_clear: Factor = 2.0
     """... other signs so many times as far, ..."""
-    vote_majority: float = 0.6
+    vote_majority: Share = 0.6
     """... and so is this share of the detections of the tracklet, ..."""
-    vote_detections: int = 3
+    vote_detections: Count = 3
     """... which has at least so many."""
-    displaced_px: float = 45.0
+    displaced_px: Pixels = 45.0
     """An outline this far off may be the only one missing in its frame of a sign that is seen before and after, ..."""
-    displaced_size: float = 0.2
+    displaced_size: Share = 0.2
     """... if its sides differ by no more than this share."""
-    duplicate_m: float = 1.5
+    duplicate_m: Length = 1.5
     """A sign this close to one that more journeys saw is a duplicate, if `vote_majority` of its detections lie on the
     other's projection and nothing else in their frames shows the other [m]."""
-    passes: int = 2
+    passes: Rounds = 2
     """What was found tells how the projections of other detections err."""
-    evidence: int = 3
+    evidence: Count = 3
     """Journeys with so many detections of a sign have seen it."""
 
 

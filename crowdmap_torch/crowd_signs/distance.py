@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.ranges import Cost, Degrees, Settings, Sigma
 from crowdmap_torch.tables import Signs
 
 NEVER = torch.inf
@@ -15,20 +16,20 @@ NEVER = torch.inf
 
 
 @dataclass(frozen=True)
-class SimilarityConfig:
+class SimilarityConfig(Settings):
     """What differences of appearance cost, in squared standard deviations."""
 
-    shape_cost: float = 7.0
+    shape_cost: Cost = 7.0
     """Different shapes: detectors take one for another in a few percent of the tracklets, `-2 log 0.03`."""
-    type_cost: float = 7.0
+    type_cost: Cost = 7.0
     """Different traffic-sign codes, both known."""
-    size_sigma: float = 0.12
+    size_sigma: Sigma = 0.12
     """1-sigma of a measured width or height, relative."""
-    size_cost_limit: float = 5.0
+    size_cost_limit: Cost = 5.0
     """Most that a difference in size can cost; with a wrong shape the size means something else."""
-    normal_sigma_deg: float = 12.0
+    normal_sigma_deg: Sigma = 12.0
     """1-sigma of the direction a sign is measured to face."""
-    normal_limit_deg: float = 75.0
+    normal_limit_deg: Degrees = 75.0
     """Signs that face directions further apart are never one: back to back, or one for each street of a crossing."""
 
 

@@ -12,19 +12,20 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_median, group_sum
 from crowdmap_torch.crowd_signs.gather import CrowdSigns
+from crowdmap_torch.ranges import Length, Settings, Share, Spacing
 
 
 @dataclass(frozen=True)
-class ExistenceConfig:
+class ExistenceConfig(Settings):
     """What a passing journey that saw a sign, or did not, says."""
 
-    false_rate: float = 0.01
+    false_rate: Share = 0.01
     """Probability that a passing journey shows a sign where there is none, at the same place as another journey."""
-    passing_m: float = 12.0
+    passing_m: Length = 12.0
     """A journey passed by a sign if it came this close to where others saw it from, heading the same way [m]."""
-    tentative: float = 0.45
+    tentative: Share = 0.45
     """Most confidence of a sign that too few journeys saw."""
-    cell_m: float = 50.0
+    cell_m: Spacing = 50.0
     """Cells in which journeys are counted that could have seen a single sign [m]."""
 
 

@@ -13,22 +13,23 @@ from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_arg
 from crowdmap_torch.clustering.neighbours import cross_pairs
 from crowdmap_torch.clustering.spectral import renumber
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, sign_distance
+from crowdmap_torch.ranges import Cost, Count, Length, Settings, Sigma
 from crowdmap_torch.tables import Signs
 
 
 @dataclass(frozen=True)
-class HeadMatchConfig:
+class HeadMatchConfig(Settings):
     """When a triangulated sign belongs to a cluster; costs are squared standard deviations."""
 
-    unmatched_cost: float = 25.0
+    unmatched_cost: Cost = 25.0
     """Cost of leaving a sign without a cluster: no pair dearer than this is matched."""
-    fragment_cost: float = 16.0
+    fragment_cost: Cost = 16.0
     """A sign left over joins a cluster up to this cost, if never seen in one frame with another member."""
-    leftover_sigma_m: float = 0.5
+    leftover_sigma_m: Sigma = 0.5
     """Uncertainty of the shift of signs left over when they are offered to the finished clusters [m]."""
-    max_distance_m: float = 3.0
+    max_distance_m: Length = 3.0
     """No sign is further from its cluster's head, however uncertain it is."""
-    candidates: int = 8
+    candidates: Count = 8
     """Heads that a sign is compared with, the nearest."""
     similarity: SimilarityConfig = field(default_factory=SimilarityConfig)
     """What differences of appearance cost."""

@@ -11,40 +11,41 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, rows_of_ranges
 from crowdmap_torch.clustering.neighbours import near_pairs
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance, sign_distance
+from crowdmap_torch.ranges import Cost, Count, Degrees, Factor, Length, Settings, Share, Sigma
 from crowdmap_torch.tables import Signs
 
 
 @dataclass(frozen=True)
-class SignMergeConfig:
+class SignMergeConfig(Settings):
     """When two clusters are one sign; costs are squared standard deviations."""
 
-    merge_cost: float = 9.0
+    merge_cost: Cost = 9.0
     """Clusters closer than this are one, unless journeys saw both in one frame."""
-    alone_m: float = 1.5
+    alone_m: Length = 1.5
     """Signs closer than this would be seen together [m]: clusters that nobody saw both of in one frame are one."""
-    alone_journeys: float = 2.5
+    alone_journeys: Factor = 2.5
     """So many journeys should have seen both for that, were there two."""
-    alone_cost: float = 12.0
+    alone_cost: Cost = 12.0
     """Most that such clusters may differ in appearance."""
-    told_apart: float = 0.3
+    told_apart: Share = 0.3
     """Share of the journeys of the smaller cluster that must have seen both in one frame for clusters to be two."""
-    overlap: float = 0.35
+    overlap: Share = 0.35
     """Clusters closer than this share of the smaller side are one plate detected twice."""
-    weak: float = 0.3
+    weak: Share = 0.3
     """A cluster with fewer journeys than this share of a similar neighbour's, not told apart from it, is dissolved."""
-    weak_cost: float = 16.0
+    weak_cost: Cost = 16.0
     """Up to this cost, shifts taken to be uncertain by `weak_sigma_m`."""
-    weak_sigma_m: float = 0.5
+    weak_sigma_m: Sigma = 0.5
     """Uncertainty of the places of weak clusters [m]."""
-    pass_m: float = 80.0
+    pass_m: Length = 80.0
     """Signs that a journey saw within this distance it saw in one pass [m]."""
-    pass_share: float = 0.5
+    pass_share: Share = 0.5
     """Share of a cluster's journeys that must have seen it and its neighbour in one pass, yet never both at once."""
-    pass_limit_deg: float = 130.0
+    pass_limit_deg: Degrees = 130.0
     """Such clusters are one sign up to this angle between them: from afar, the side a plate is turned to is a guess."""
-    max_distance_m: float = 3.0
+    max_distance_m: Length = 3.0
     """Clusters further apart are never one."""
-    candidates: int = 8
+    candidates: Count = 8
     """Clusters that a cluster is compared with, the nearest."""
     similarity: SimilarityConfig = field(default_factory=SimilarityConfig)
     """What differences of appearance cost."""

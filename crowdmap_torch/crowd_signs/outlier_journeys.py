@@ -10,32 +10,33 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_count, group_median
+from crowdmap_torch.ranges import Count, Degrees, Deviations, Length, Settings, Share
 from crowdmap_torch.tables import Signs
 
 
 @dataclass(frozen=True)
-class OutlierJourneyConfig:
+class OutlierJourneyConfig(Settings):
     """When a journey is taken for a bad drive. Limits are in the crowd's own robust spread where they say so."""
 
-    min_signs: int = 4
+    min_signs: Count = 4
     """Journeys with fewer signs are not judged."""
-    spread: float = 6.0
+    spread: Deviations = 6.0
     """Figures further from the crowd's median than this many robust standard deviations are suspicious."""
-    min_matched: float = 0.5
+    min_matched: Share = 0.5
     """Least share of a journey's signs that others saw too where they passed, relative to the median journey's."""
-    min_bias_m: float = 4.0
+    min_bias_m: Length = 4.0
     """Biases below this are never suspicious [m]."""
-    min_scatter_m: float = 0.7
+    min_scatter_m: Length = 0.7
     """Median miss of its signs, bias and drift taken off, that is never suspicious below [m]."""
-    min_turn_deg: float = 2.0
+    min_turn_deg: Degrees = 2.0
     """Median turn of its signs against the crowd's that is never suspicious below [deg]."""
-    min_roll_deg: float = 1.5
+    min_roll_deg: Degrees = 1.5
     """Median roll of its signs in their planes against the crowd's that is never suspicious below [deg]."""
-    min_stretch: float = 0.035
+    min_stretch: Share = 0.035
     """Median relative size against the crowd's that is never suspicious below."""
-    min_drift_m: float = 1.25
+    min_drift_m: Length = 1.25
     """Largest drift along a journey that is never suspicious below [m]."""
-    max_leap_m: float = 4.0
+    max_leap_m: Length = 4.0
     """Largest step between two frames beyond what a car can drive [m]."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -61,33 +62,34 @@ from crowdmap_torch.crowd_signs.outlier_journeys import (
 )
 from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import FILLED, Count, Rounds, Settings, Share, Sigma, Spacing
 from crowdmap_torch.tables import Signs
 
 METHODS = ("joint", "paper2017")
 
 
 @dataclass(frozen=True)
-class CrowdConfig:
+class CrowdConfig(Settings):
     """How the signs of many journeys are told apart and the journeys' biases found."""
 
     method: str = "joint"
     """`joint`, or `paper2017`: the paper's clusters of the places as they are, once, and the mean biases from them."""
-    shift_sigmas_m: tuple[float, ...] = (0.45, 0.3, 0.2, 0.15)
+    shift_sigmas_m: Annotated[tuple[Sigma, ...], FILLED] = (0.45, 0.3, 0.2, 0.15)
     """`joint`: how uncertain the journeys' shifts are taken to be, coarse to fine, 1-sigma along each axis [m]."""
-    least_sigma_m: tuple[float, float, float] = (0.25, 0.12, 0.06)
+    least_sigma_m: tuple[Sigma, Sigma, Sigma] = (0.25, 0.12, 0.06)
     """`joint`: least 1-sigma of a journey's sign along the line of sight, across it and upwards, shifts left out [m].
 
     The covariance from triangulation knows pixels, not how poses wander while a sign is in view.
     """
-    rounds: int = 4
+    rounds: Rounds = 4
     """`joint`: most alternations of clustering and alignment for each of these."""
-    seed_journeys: int = 60
+    seed_journeys: Count = 60
     """`joint`: most journeys that clusters are first made from in one place; the others' signs are matched to those."""
-    seed_cell_m: float = 50.0
+    seed_cell_m: Spacing = 50.0
     """Size of a place [m]."""
-    stands_still: float = 0.001
+    stands_still: Share = 0.001
     """`joint`: clusters stand still when at most this share of the signs changes."""
-    min_journeys: int = 2
+    min_journeys: Count = 2
     """`joint`: signs seen by fewer are singles, kept apart as tentative (of a single journey, its signs are the map)."""
     cluster: SignClusterConfig = field(default_factory=SignClusterConfig)
     """Grouping from places alone."""
@@ -106,6 +108,7 @@ class CrowdConfig:
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import rows_of_ranges
 from crowdmap_torch.clustering.voting import densest
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance
+from crowdmap_torch.ranges import Count, Length, Settings, Spacing
 from crowdmap_torch.tables import Signs
 
 _SWEEPS = 24
@@ -23,22 +24,22 @@ _LOOKUPS = 1 << 21
 
 
 @dataclass(frozen=True)
-class VoteConfig:
+class VoteConfig(Settings):
     """How the shifts between journeys are first found."""
 
-    radius_m: float = 6.0
+    radius_m: Length = 6.0
     """Largest shift between two journeys, east or north [m]."""
-    height_m: float = 8.0
+    height_m: Length = 8.0
     """Largest shift upwards [m]."""
-    width_m: float = 0.4
+    width_m: Length = 0.4
     """Kernel of the vote: what slow drift and triangulation leave between two journeys [m]."""
-    partners: int = 10
+    partners: Count = 10
     """Journeys that each journey is compared with, chosen at random among those that share its roads."""
-    cell_m: float = 50.0
+    cell_m: Spacing = 50.0
     """Journeys share a road where both saw a sign within a cell of this size [m]."""
-    votes: int = 200
+    votes: Count = 200
     """Most pairs of signs compared between two journeys, chosen at random."""
-    outlier_m: float = 1.2
+    outlier_m: Length = 1.2
     """Shifts between two journeys that miss by more than this are taken for wrong votes [m]."""
     similarity: SimilarityConfig = field(default_factory=SimilarityConfig)
     """What differences of appearance cost a vote."""

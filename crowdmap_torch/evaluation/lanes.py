@@ -18,22 +18,23 @@ from crowdmap_torch.evaluation.polyline import (
     sample_polylines,
 )
 from crowdmap_torch.evaluation.statistics import ErrorFigures, error_figures, share
+from crowdmap_torch.ranges import Count, Length, Settings, Spacing, Span
 from crowdmap_torch.tables import Lanes, Survey
 
 
 @dataclass(frozen=True)
-class LaneEvaluationConfig:
+class LaneEvaluationConfig(Settings):
     """How true markers are sampled and when a sample counts as found."""
 
-    step_m: float = 0.5
+    step_m: Spacing = 0.5
     """Distance of the samples along a marker."""
-    lateral_gate_m: float = 0.5
-    vertical_gate_m: float = 2.0
-    min_journeys: int = 3
+    lateral_gate_m: Length = 0.5
+    vertical_gate_m: Length = 2.0
+    min_journeys: Count = 3
     """Recall is over the length seen by this many journeys."""
-    width_m: tuple[float, float] = (2.0, 5.0)
+    width_m: Span = (2.0, 5.0)
     """The neighbouring marker is this far away."""
-    width_step_m: float = 2.5
+    width_step_m: Spacing = 2.5
     """Distance of the places where the lane width is taken."""
 
 

@@ -18,6 +18,7 @@ from crowdmap_torch.evaluation.statistics import (
     share,
 )
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.ranges import Count, Length, Settings
 from crowdmap_torch.survey.matching import (
     DUPLICATE,
     FALSE,
@@ -29,15 +30,15 @@ from crowdmap_torch.tables import Signs, SurveySigns
 
 
 @dataclass(frozen=True)
-class SignEvaluationConfig:
+class SignEvaluationConfig(Settings):
     """How signs are matched and which neighbours the relative error looks at."""
 
     match: SurveyMatchConfig = field(default_factory=SurveyMatchConfig)
-    relative_radius_m: float = 150.0
+    relative_radius_m: Length = 150.0
     """Matched signs within this distance are brought onto the truth together."""
-    relative_min_signs: int = 3
+    relative_min_signs: Count = 3
     """Fewer signs in that circle, its own centre counted, and the sign has no relative error."""
-    close_pair_m: float = 1.0
+    close_pair_m: Length = 1.0
     """True signs this near to each other stand on one post."""
 
 

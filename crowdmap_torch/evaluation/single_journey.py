@@ -29,6 +29,7 @@ from crowdmap_torch.evaluation.visibility import frames_of_signs
 from crowdmap_torch.geometry import camera as camera_module
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.truth import JourneyTruth
+from crowdmap_torch.ranges import Count, Settings
 from crowdmap_torch.survey.matching import DUPLICATE, FALSE
 from crowdmap_torch.tables import Lanes, Signs, Survey
 
@@ -40,10 +41,10 @@ _VIEW_STEP_M = 5.0
 
 
 @dataclass(frozen=True)
-class SingleJourneyConfig:
+class SingleJourneyConfig(Settings):
     """Which true signs a journey is expected to map."""
 
-    min_frames: int = 10
+    min_frames: Count = 10
     """Recall is over true signs detected in this many frames of the journey."""
     signs: SignEvaluationConfig = field(default_factory=SignEvaluationConfig)
     lanes: LaneEvaluationConfig = field(default_factory=LaneEvaluationConfig)

@@ -103,13 +103,7 @@ def _read_journey_truth(folder: Path, survey: Survey, journey: Journey) -> Journ
     sign, outlier = _read_labels(folder / "signs.parquet", "sign_id", survey.sign_id, rows["sign"])
     lane, _ = _read_labels(folder / "lanes.parquet", "lane_id", survey.lane_id, rows["lane"])
     frame = torch.full((len(sign),), -1, dtype=torch.int64)
-    row = journey.signs.row.cpu()
-    if len(row) and int(row.max()) >= len(sign):
-        raise ValueError(
-            f"{folder / 'signs.parquet'}: {len(sign)} rows, but the journey's signs.parquet has a "
-            f"row {int(row.max())}; expected a line for each row. Is it another dataset's truth?"
-        )
-    frame[row] = journey.signs.frame.cpu()
+    frame[journey.signs.row.cpu()] = journey.signs.frame.cpu()
     return JourneyTruth(
         journey=journey,
         T_world_camera=T_world_link @ journey.rig.T_link_camera,
@@ -164,6 +158,11 @@ def _read_labels(
             "Is it another dataset's truth?"
         ),
     )
+    if len(np.unique(rows_given)) != most or len(sheet) != most:
+        raise sheet.fault(
+            f"{len(sheet)} rows for the {most} of the journey's {path.name}; expected a line for "
+            "each row. Is it another dataset's truth?"
+        )
     row = torch.from_numpy(rows_given)
     names = sheet.strings(column, optional=True)
     label = index_in(names, ids)

@@ -8,6 +8,7 @@ drove it, weighs them by how far away they were seen, and cuts a marker into pie
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,6 +22,18 @@ from crowdmap_torch.lanes.pieces import (
     cut_by_length,
     cut_by_number,
     fit_pieces,
+)
+from crowdmap_torch.ranges import (
+    FILLED,
+    Count,
+    Factor,
+    Length,
+    Pixels,
+    Range,
+    Settings,
+    Sigma,
+    Spacing,
+    Span,
 )
 from crowdmap_torch.road.ground_projection import (
     GroundPoints,
@@ -37,68 +50,65 @@ KEPT, FEW_FRAMES, NO_POINTS, SHORT, UNCERTAIN = range(len(REASONS))
 
 
 @dataclass(frozen=True)
-class PaperPieces:
+class PaperPieces(Settings):
     """The pieces of the paper (IV-D)."""
 
-    recent_points: int = 200
+    recent_points: Count = 200
     """Points of a piece; a new piece begins after half of them."""
-    range_m: tuple[float, float] = (2.0, 45.0)
+    range_m: Span = (2.0, 45.0)
     """Depth of the points that are used."""
 
 
 @dataclass(frozen=True)
-class LaneConfig:
+class LaneConfig(Settings):
     """How lane tracklets become splines (IV-D)."""
 
     method: str = "surface"
     """`surface`: points on the road that the car drove; `paper2017`: points on one plane a frame,
     most recent points."""
-    min_frames: int = 4
+    min_frames: Count = 4
     """Tracklets with fewer detections are pruned."""
-    min_length_m: float = 4.0
+    min_length_m: Length = 4.0
     """Pieces that are shorter are pruned."""
-    min_points: int = 12
+    min_points: Count = 12
     """Pieces with fewer points are pruned."""
-    max_sigma_m: float = 1.0
+    max_sigma_m: Sigma = 1.0
     """Pieces whose control points are less sure, in the mean, are pruned."""
-    range_m: tuple[float, float] = (2.0, 25.0)
+    range_m: Span = (2.0, 25.0)
     """Depth of the points that are used; method `surface`."""
-    piece_m: float = 40.0
+    piece_m: Spacing = 40.0
     """Length of a piece."""
-    overlap: float = 0.5
+    overlap: Annotated[float, Range(0, 0.89, "a share: with more, pieces hardly move on")] = 0.5
     """Share of a piece that the next one covers too."""
-    control_points: int = 6
+    control_points: Annotated[int, Range(2, 1000, "a spline has two ends")] = 6
     """Of a whole piece; shorter ones have fewer, at the same spacing."""
-    max_gap_m: float = 12.0
+    max_gap_m: Length = 12.0
     """A marker without points over a longer way ends, and begins again behind it: dashes are bridged,
     intersections are not."""
-    noise_px: float = 1.0
+    noise_px: Pixels = 1.0
     """1-sigma of lane points."""
-    normal_sigma: float = 1.5e-3
+    normal_sigma: Sigma = 1.5e-3
     """1-sigma of the normal's error that changes from frame to frame [rad]."""
-    drift: float = 0.01
+    drift: Sigma = 0.01
     """Drift of the car's reckoned way over one metre [m]; with the square root of the way."""
-    sigma_m: float = 0.04
+    sigma_m: Sigma = 0.04
     """1-sigma of a piece's lateral error that its points share."""
-    height_sigma: float = 0.015
+    height_sigma: Sigma = 0.015
     """1-sigma of the camera height, as a share of it: offsets are off by the same share."""
-    smoothing: float = 1e-4
+    smoothing: Factor = 1e-4
     """Price of bending, in units of a piece's whole weight."""
-    scales: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0)
+    scales: Annotated[tuple[Factor, ...], FILLED] = (8.0, 4.0, 2.0, 1.0)
     """Factors on the noise in iterated least squares (Tukey), coarse to fine."""
-    confident_frames: float = 4.0
+    confident_frames: Factor = 4.0
     """Detections that a piece needs for its confidence to reach 1 - 1/e."""
     paper: PaperPieces = field(default_factory=PaperPieces)
     """Method `paper2017`."""
 
     def __post_init__(self) -> None:
-        """Refuses unknown methods and pieces that do not overlap as they should."""
+        """Refuses unknown methods."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, found {self.method!r}")
-        if not 0 <= self.overlap < 0.9:
-            raise ValueError(f"overlap: expected a share from 0 to below 0.9, found {self.overlap}")
-        if self.control_points < 2:
-            raise ValueError(f"control_points: expected two or more, found {self.control_points}")
 
 
 @dataclass(frozen=True)

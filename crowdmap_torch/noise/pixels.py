@@ -14,20 +14,21 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.optim.robust import median_scale
+from crowdmap_torch.ranges import Pixels, Settings, Sigma
 
 _CLASSES = 8
 """Classes of boxes of about equal numbers, by size."""
 
 
 @dataclass(frozen=True)
-class PixelNoiseConfig:
+class PixelNoiseConfig(Settings):
     """Noise of the corners of detections."""
 
-    sigma_px: float = 0.6
+    sigma_px: Pixels = 0.6
     """Noise of each corner of a large detection, per axis [px]."""
-    small_box_px: float = 12.0
+    small_box_px: Pixels = 12.0
     """Box at which that noise has grown by a factor of 1.41 [px]."""
-    box_sigma: float = 0.5
+    box_sigma: Sigma = 0.5
     """Noise of width and height of detections that are axis-aligned boxes, as a share: boxes are drawn around a sign, wider
     than its outline where it is seen at an angle."""
 

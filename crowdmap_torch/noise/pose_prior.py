@@ -17,19 +17,20 @@ from torch import Tensor
 
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
 from crowdmap_torch.tables import Journey
 
 
 @dataclass(frozen=True)
-class PosePriorConfig:
+class PosePriorConfig(Settings):
     """How far the sigmas of journeys may be from those that they are given."""
 
-    scale_strength: float = 24.0
+    scale_strength: Freedom = 24.0
     """Degrees of freedom that the fleet's scale of the sigmas counts in a journey's own."""
-    scale_trust: float = 3.0
+    scale_trust: Freedom = 3.0
     """Degrees of freedom that the sigmas as they are given count in the fleet's scale."""
-    scale_lag_m: float = 100.0
+    scale_lag_m: Length = 100.0
     """Way over which the drift's changes are compared with their sigma."""
 
 

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.ranges import FILLED, Factor, Length, Settings, Sigma, SigmaOrNone, Spacing
 from crowdmap_torch.residuals.pose import (
     gauss_markov_start,
     gauss_markov_start_jacobian,
@@ -30,30 +32,30 @@ CAR_CHANGES_M = 1e6
 
 
 @dataclass(frozen=True)
-class PositioningNoise:
+class PositioningNoise(Settings):
     """What positioning gets wrong where it does not say itself; every sigma is 1-sigma per axis.
 
     The error of a journey's poses is a constant bias, a slow drift about it (an Ornstein-Uhlenbeck process along the
     way), and noise from frame to frame.
     """
 
-    bias_sigma_m: tuple[float, float, float] = (0.6, 0.6, 0.9)
+    bias_sigma_m: tuple[Sigma, Sigma, Sigma] = (0.6, 0.6, 0.9)
     """Constant error of a journey's positions: east, north, up [m]. Between lane-level positioning (the paper, I; 0.3 m in
     simulations) and a consumer receiver beside an IMU (0.85 m); each journey's own scale is estimated from there."""
-    bias_sigma_deg: float = 0.05
+    bias_sigma_deg: Sigma = 0.05
     """Constant error of the rotation: the camera's place in its car included [deg]."""
-    drift_sigma_m: float = 0.25
+    drift_sigma_m: Sigma = 0.25
     """Slow error of the position [m]; with it the paper's method ends near the paper's relative error (docs/RESULTS.md)."""
-    drift_length_m: float = 150.0
+    drift_length_m: Length = 150.0
     """Way over which its correlation falls to 1/e [m]."""
-    rotation_sigma_deg: float = 0.15
+    rotation_sigma_deg: Sigma = 0.15
     """Slow error of the rotation [deg]. A consumer gyro of 0.014 deg/s/sqrt(Hz) alone walks 0.04 in the ten seconds that
     100 m take; what holds it to the vertical and to the way wanders too."""
-    rotation_length_m: float = 100.0
+    rotation_length_m: Length = 100.0
     """Way over which its correlation falls to 1/e [m]."""
-    white_sigma_m: float = 0.02
+    white_sigma_m: SigmaOrNone = 0.02
     """Noise of the position from frame to frame [m]: what a filter of GNSS and IMU leaves, as in simulations."""
-    white_sigma_deg: float = 0.03
+    white_sigma_deg: SigmaOrNone = 0.03
     """Noise of the rotation from frame to frame [deg]; fits of single drives hardly tell 0.02 from 0.03 (kitti-signs)."""
 
     @property
@@ -83,21 +85,21 @@ class PositioningNoise:
 
 
 @dataclass(frozen=True)
-class DriftPathConfig:
+class DriftPathConfig(Settings):
     """How the drift of one drive is estimated along with what was seen."""
 
-    scales: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0, 2.0)
+    scales: Annotated[tuple[Factor, ...], FILLED] = (0.125, 0.25, 0.5, 1.0, 2.0)
     """Multiples of the usual drift of which each journey shows the most likely."""
-    sigma_log_scale: float = 0.7
+    sigma_log_scale: Sigma = 0.7
     """Spread of the logarithm of that multiple among journeys."""
-    knot_m: float = 4.0
+    knot_m: Spacing = 4.0
     """Distance between the knots of the path."""
-    max_window_m: float = 160.0
+    max_window_m: Length = 160.0
     """Views further from the closest one share the drift there: detections that follow the car for miles are false."""
 
-    slip_sigma_rad: float = 0.03
+    slip_sigma_rad: Sigma = 0.03
     """1-sigma of the angle between the camera's axis and the car's, beyond what is known of it."""
-    lever_sigma_m: float = 1.0
+    lever_sigma_m: Sigma = 1.0
     """1-sigma of the distance of the camera from the axle that does not steer, likewise."""
 
 

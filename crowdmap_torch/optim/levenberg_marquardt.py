@@ -18,6 +18,7 @@ from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import Backend, NormalEquations, Tangents
+from crowdmap_torch.ranges import Damping, Factor, RoundsOrNone, Settings, Share
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
 _NEAR_BEST = 0.2
@@ -33,22 +34,22 @@ REASONS = (
 
 
 @dataclass(frozen=True)
-class LmConfig:
+class LmConfig(Settings):
     """When to stop, and how the damping moves (Madsen, Nielsen and Tingleff 2004, section 3.2)."""
 
-    max_iterations: int = 50
+    max_iterations: RoundsOrNone = 50
     """Most steps, rejected ones counted."""
-    cost_tolerance: float = 1e-6
+    cost_tolerance: Share = 1e-6
     """Stop when an accepted step lowers the cost by less than this share of it."""
-    step_tolerance: float = 1e-10
+    step_tolerance: Share = 1e-10
     """Stop when the step's norm, in tangent units, is below this."""
-    initial_damping: float = 1e-4
+    initial_damping: Damping = 1e-4
     """First damping, relative to the Hessian's diagonal."""
-    max_damping: float = 1e12
+    max_damping: Damping = 1e12
     """A problem whose damping passes this has stalled."""
-    min_damping: float = 1e-12
+    min_damping: Damping = 1e-12
     """The damping never falls below this."""
-    max_stretch: float = 1.0
+    max_stretch: Factor = 1.0
     """Longest that an accepted step may be made, as a multiple, where the model proved wrong about its length: the
     weights of robust losses overrate the curvature. 1: never; a change costs one more evaluation of the cost."""
 

@@ -13,20 +13,21 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_sum
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.ranges import Length, Settings, SigmaOrOff
 from crowdmap_torch.residuals.reprojection import components, corner_world
 
 
 @dataclass(frozen=True)
-class SignHabit:
+class SignHabit(Settings):
     """How far signs are from what is usual, 1-sigma."""
 
-    facing_rad: float = 0.5
+    facing_rad: SigmaOrOff = 0.5
     """Angle between a sign's normal and the direction it is driven at."""
-    upright_rad: float = 0.1
+    upright_rad: SigmaOrOff = 0.1
     """Roll and tilt."""
-    typical_size_m: float = 0.75
+    typical_size_m: Length = 0.75
     """Median width and height."""
-    log_size: float = 0.8
+    log_size: SigmaOrOff = 0.8
     """Logarithms of width and height about that."""
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from crowdmap_torch.geometry.camera import Camera, project, unproject
 from crowdmap_torch.geometry.plane import fit_plane
+from crowdmap_torch.ranges import Degrees, Length, Pixels, Settings
 
 MIN_POINTS = 6
 """Points of a picture; ePnP needs four, and has no way to see a wrong one among so few."""
@@ -45,14 +46,14 @@ class Annotations:
 
 
 @dataclass(frozen=True)
-class CalibrationConfig:
+class CalibrationConfig(Settings):
     """When pictures are good enough."""
 
-    max_rms_px: float = 3.0
+    max_rms_px: Pixels = 3.0
     """Pictures whose points miss by more are refused."""
-    max_spread_deg: float = 1.0
+    max_spread_deg: Degrees = 1.0
     """Pictures whose normal is further than this from the mean are refused."""
-    max_floor_m: float = 0.02
+    max_floor_m: Length = 0.02
     """Floor points further than this from their plane are refused."""
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry.plane import harmonic_mean_singular_value, smallest_singular_value
+from crowdmap_torch.ranges import FILLED, Count, Place, Rounds, Settings, Spacing
 from crowdmap_torch.road.ego_motion import EgoMotion
 from crowdmap_torch.tables import Rows
 
@@ -27,31 +29,32 @@ COSTS = {
 
 
 @dataclass(frozen=True)
-class CoplanarityConfig:
+class CoplanarityConfig(Settings):
     """The online adjustment exactly as in the paper (IV-C, eq:rne)."""
 
     cost: str = "smallest_singular_value"
     """Of a segment's scatter matrix; or `harmonic_mean` of the singular values, the cheaper
     surrogate."""
-    segment_m: float = 20.0
+    segment_m: Spacing = 20.0
     """Length of the segments over which the road counts as planar."""
-    segments: int = 10
+    segments: Count = 10
     """Most recent segments in the sum."""
-    min_segments: int = 3
+    min_segments: Count = 3
     """Fewer than these do not start an adjustment."""
-    poses: int = 16
+    poses: Count = 16
     """Poses of a segment, equally spaced."""
-    update_m: float = 30.0
+    update_m: Spacing = 30.0
     """The normal is estimated anew after so much travel."""
-    points_right: tuple[float, ...] = (-0.5, -0.25, 0.0, 0.25, 0.5)
+    points_right: Annotated[tuple[Place, ...], FILLED] = (-0.5, -0.25, 0.0, 0.25, 0.5)
     """Fixed points below the horizon: on the plane z = 1 of the calibrated road frame, to the
     right."""
-    points_down: tuple[float, ...] = (0.1, 0.15, 0.225, 0.35)
+    points_down: Annotated[tuple[Place, ...], FILLED] = (0.1, 0.15, 0.225, 0.35)
     """Likewise, below the calibrated horizon."""
-    iterations: int = 12
+    iterations: Rounds = 12
     """Most damped Newton steps."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.cost not in COSTS:
             raise ValueError(f"cost: expected one of {', '.join(COSTS)}, found {self.cost!r}")
 

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import Degrees, RoundsOrNone, Settings
 from crowdmap_torch.road.coplanarity import (
     CoplanarityConfig,
     NormalUpdates,
@@ -52,15 +53,15 @@ METHODS = ("smoothed", "causal", "paper2017", "calibration")
 
 
 @dataclass(frozen=True)
-class RoadConfig:
+class RoadConfig(Settings):
     """How the road normal is followed during a drive (IV-C)."""
 
     method: str = "smoothed"
     """`smoothed`: all measurements, all frames; `causal`: past frames only; `paper2017`: eq:rne on past frames;
     `calibration`: no adjustment."""
-    max_adjustment_deg: float = 3.0
+    max_adjustment_deg: Degrees = 3.0
     """Normals further from calibration than this are not admitted."""
-    refinements: int = 1
+    refinements: RoundsOrNone = 1
     """How often the markers are looked at again on the curved road found so far; method
     `smoothed`."""
     coplanarity: CoplanarityConfig = field(default_factory=CoplanarityConfig)
@@ -72,6 +73,7 @@ class RoadConfig:
 
     def __post_init__(self) -> None:
         """Refuses unknown methods."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, found {self.method!r}")
 

@@ -24,6 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import Deviations, Settings, Sigma
 
 SLOPE, GROWTH, STANCE, CROSS, TWIST, ROLL = range(6)
 """Columns of the state."""
@@ -33,16 +34,16 @@ MISSING = 1e6
 
 
 @dataclass(frozen=True)
-class KalmanConfig:
+class KalmanConfig(Settings):
     """How roads bend, how cars stand on them, and how far measurements may be off; pairs are (ahead, to the right)."""
 
-    stance_sigma: tuple[float, float] = (0.014, 0.0035)
+    stance_sigma: tuple[Sigma, Sigma] = (0.014, 0.0035)
     """1-sigma of the loaded car's pitch and roll against calibration [rad]."""
-    stance_rate: tuple[float, float] = (5e-4, 1e-5)
+    stance_rate: tuple[Sigma, Sigma] = (5e-4, 1e-5)
     """Random walk of the two over one second: braking, passengers [rad]."""
-    growth_rate: tuple[float, float] = (1.5e-4, 1.5e-4)
+    growth_rate: tuple[Sigma, Sigma] = (1.5e-4, 1.5e-4)
     """Random walk of the growth of the slopes over one metre of travel [1/m]."""
-    gate: float = 2.5
+    gate: Deviations = 2.5
     """A measurement further off than this, in standard deviations, counts as one with so much
     larger a sigma (Huber)."""
 

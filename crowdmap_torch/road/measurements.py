@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import Duration, Length, Settings, Sigma, Span
 from crowdmap_torch.road.ego_motion import EgoMotion
 from crowdmap_torch.road.kalman import (
     CROSS,
@@ -28,26 +29,26 @@ from crowdmap_torch.road.vanishing_point import LaneRays, VanishingConfig, Vanis
 
 
 @dataclass(frozen=True)
-class MeasurementConfig:
+class MeasurementConfig(Settings):
     """How far each kind of measurement can be trusted; pairs are (pitch, roll), angles in radians."""
 
-    shaking: tuple[float, float] = (2.5e-3, 1.3e-3)
+    shaking: tuple[Sigma, Sigma] = (2.5e-3, 1.3e-3)
     """1-sigma of the springs' pitch and roll."""
-    shaking_memory_s: float = 0.2
+    shaking_memory_s: Duration = 0.2
     """Time after which the springs have forgotten it."""
-    parallel_sigma: float = 1.5e-3
+    parallel_sigma: Sigma = 1.5e-3
     """What is wrong with a frame's vanishing point besides the points' noise: markers are not quite
     parallel."""
-    chord_m: float = 20.0
+    chord_m: Length = 20.0
     """Travel after which the slope of the way itself is looked at."""
-    chord_sigma: float = 1.1e-2
+    chord_sigma: Sigma = 1.1e-2
     """1-sigma of it, from the drift of positions over that way and that of rotations over much
     longer ways."""
-    width_m: float = 100.0
+    width_m: Length = 100.0
     """Travel after which the widths of neighbouring lanes are compared."""
-    width_sigma: float = 0.025
+    width_sigma: Sigma = 0.025
     """1-sigma of a lane's width against its neighbours', as a share of it."""
-    width_range_m: tuple[float, float] = (2.4, 4.6)
+    width_range_m: Span = (2.4, 4.6)
     """Markers so far apart are taken for the two sides of one lane."""
     vanishing: VanishingConfig = field(default_factory=VanishingConfig)
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.noise.positioning import DriftPathConfig, PositioningNoise, knot_count
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.ranges import Settings, Sigma
 from crowdmap_torch.residuals.pose import sideways_parting, sideways_parting_jacobian
 from crowdmap_torch.road.dead_reckoning import dead_reckon, direction, fit_slip, headings
 from crowdmap_torch.road.ego_motion import EgoMotion, motion_of
@@ -23,12 +24,12 @@ from crowdmap_torch.tables import Journey
 
 
 @dataclass(frozen=True)
-class NonholonomicConfig:
+class NonholonomicConfig(Settings):
     """How well cars hold the non-holonomic constraint."""
 
-    slide_sigma: float = 2.5e-3
+    slide_sigma: Sigma = 2.5e-3
     """1-sigma of the angle between the car's way and its wheels, which comes and goes, from knot to knot [rad]."""
-    blind_sigma: float = 1.3e-3
+    blind_sigma: Sigma = 1.3e-3
     """1-sigma of the way sideways between two frames that no heading shows, over the square of their distance [1/m]: next
     to nothing at a camera's rate, centimetres where frames are missing."""
 

@@ -14,6 +14,7 @@ the poses' errors is in it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_sum
 from crowdmap_torch.optim.robust import Tukey
+from crowdmap_torch.ranges import FILLED, Factor, Pixels, Settings, SigmaOrNone, Span
 
 _SHARED = 4
 """Unknowns of a frame: alpha, psi, kappa, kappa'."""
@@ -31,17 +33,17 @@ _PRIOR_OFFSET = 1e-6
 
 
 @dataclass(frozen=True)
-class VanishingConfig:
+class VanishingConfig(Settings):
     """How the vanishing point of lane markers is found in a frame."""
 
-    noise_px: float = 1.0
+    noise_px: Pixels = 1.0
     """1-sigma of lane points."""
-    range_m: tuple[float, float] = (3.0, 35.0)
+    range_m: Span = (3.0, 35.0)
     """Nearest and farthest depth of the points that are used."""
-    bend_sigma: float = 3e-4
+    bend_sigma: SigmaOrNone = 3e-4
     """What the road bends up or down beyond what is known of it [1/m]; takes weight from far
     points."""
-    scales: tuple[float, ...] = (16.0, 6.0, 2.0, 1.0)
+    scales: Annotated[tuple[Factor, ...], FILLED] = (16.0, 6.0, 2.0, 1.0)
     """Factors on the noise, one for each step of iterated least squares (Tukey): from coarse to
     fine."""
 

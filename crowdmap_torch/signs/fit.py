@@ -36,6 +36,7 @@ from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.banded_schur import BandBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, NormalEquations
+from crowdmap_torch.ranges import Deviations, RoundsOrNone, Settings, Share
 from crowdmap_torch.residuals.reprojection import (
     corner_errors_jacobian,
     drifting_sign_view,
@@ -57,28 +58,28 @@ from crowdmap_torch.signs.views import (
 
 
 @dataclass(frozen=True)
-class SignFitConfig:
+class SignFitConfig(Settings):
     """Noise of detections, what signs are like, and the minimisation."""
 
     pixels: PixelNoiseConfig = field(default_factory=PixelNoiseConfig)
     """Noise of the corners."""
-    max_noise_scale: float = 4.0
+    max_noise_scale: Deviations = 4.0
     """The noise of each sign's corners is estimated from its own residuals, up to this multiple of the above."""
-    white_share: float = 0.8
+    white_share: Share = 0.8
     """Share of the usual white noise of positions that is taken for one drive's: with all of it signs that a few frames
     place to half a metre are pruned."""
     drift: DriftPathConfig = field(default_factory=DriftPathConfig)
     """How the poses' drift is estimated along with the signs."""
     nonholonomic: NonholonomicConfig = field(default_factory=NonholonomicConfig)
     """How far the car holds that constraint on the drift."""
-    tukey: float = 2.8
+    tukey: Deviations = 2.8
     """Detections with a root mean square whitened error beyond this many standard deviations have no say."""
-    tukey_alone: float = 20.0
+    tukey_alone: Deviations = 20.0
     """The same of signs fitted one by one, whose residuals hold the errors of the poses too: those move the nearest views
     most, which tell most."""
     habit: SignHabit = field(default_factory=SignHabit)
     """What signs are like before anything is seen of them."""
-    rounds: int = 2
+    rounds: RoundsOrNone = 2
     """How often the views' own pose errors are estimated and the fit is repeated."""
     lm: lm.LmConfig = field(
         default_factory=lambda: lm.LmConfig(max_iterations=30, cost_tolerance=1e-4)

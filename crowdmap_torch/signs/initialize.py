@@ -13,6 +13,7 @@ from crowdmap_torch.clustering.groups import group_median, group_sum
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.triangulation import midpoint_ragged
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import Angle, Count, Settings
 from crowdmap_torch.residuals.sign_prior import against_the_drive
 from crowdmap_torch.signs.fit import SignFitConfig, fit_signs_coarsely, robust_noise_scale
 from crowdmap_torch.signs.views import SignStart, SignViews, thinned
@@ -29,12 +30,12 @@ MAX_SIZE_RATIO = 3.0
 
 
 @dataclass(frozen=True)
-class SignStartConfig:
+class SignStartConfig(Settings):
     """Where joint fits begin."""
 
-    yaw_deg: tuple[float, ...] = (-30.0, 30.0)
+    yaw_deg: tuple[Angle, ...] = (-30.0, 30.0)
     """Angles from the line of sight to start from, beside the best plane."""
-    max_views: int = 16
+    max_views: Count = 16
     """Views of each sign that the starts are compared on."""
 
 

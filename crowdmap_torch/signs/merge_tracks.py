@@ -11,32 +11,33 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_argmin
 from crowdmap_torch.clustering.neighbours import near_pairs
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import Deviations, Factor, Length, Seconds, Settings, Share, Sigma, Speed
 from crowdmap_torch.signs.views import SignFit, SignViews, distance_away
 from crowdmap_torch.tables import Journey, Tracklets
 
 
 @dataclass(frozen=True)
-class RejoinConfig:
+class RejoinConfig(Settings):
     """When two tracklets are one sign."""
 
-    max_common_share: float = 0.1
+    max_common_share: Share = 0.1
     """Tracklets with a larger share of the shorter one's frames in common are two signs: both were seen at once."""
-    overlap: float = 0.35
+    overlap: Share = 0.35
     """Unless they are in one place: as seen from the closest view, less than this share of the smaller side apart."""
 
-    max_distance: float = 4.0
+    max_distance: Deviations = 4.0
     """Centres further apart, in standard deviations of both and of the drift between them, are two signs."""
-    max_distance_m: float = 5.0
+    max_distance_m: Length = 5.0
     """As are those further apart than this."""
-    max_size_ratio: float = 1.5
+    max_size_ratio: Factor = 1.5
     """As are signs whose width or height differ by more; the square of it where one of them is vague."""
-    min_facing: float = 0.5
+    min_facing: Share = 0.5
     """As are signs whose normals have a smaller scalar product, unless one of them is vague."""
-    vague_sigma_m: float = 0.7
+    vague_sigma_m: Sigma = 0.7
     """A sign is vague if its centre has a larger standard deviation."""
-    speed: float = 12.0
+    speed: Speed = 12.0
     """Turns the time between two tracklets into a way [m/s]."""
-    max_gap_s: float = 20.0
+    max_gap_s: Seconds = 20.0
     """Tracklets with a longer silence between them are two passes of a sign, and poses do not come back the same."""
 
 

@@ -12,6 +12,17 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_argmin, group_mode, group_sum
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.ranges import (
+    Count,
+    Degrees,
+    Deviations,
+    Factor,
+    Length,
+    Settings,
+    Share,
+    Sigma,
+    Span,
+)
 from crowdmap_torch.residuals.sign_prior import against_the_drive
 from crowdmap_torch.road.nonholonomic import DrivePath, drive_path
 from crowdmap_torch.signs.fit import SignFitConfig, fit_signs, fit_signs_alone
@@ -44,38 +55,38 @@ KEPT, FEW_FRAMES, NO_PARALLAX, TOO_FAR, BEHIND, RESIDUAL, UNCERTAIN, SIZE, REJOI
 
 
 @dataclass(frozen=True)
-class SignTriangulationConfig:
+class SignTriangulationConfig(Settings):
     """How tracklets become signs, and which do not (IV-B)."""
 
     method: str = "joint"
     """`joint`: all signs and the drift of the poses as one problem, several starts, fragments rejoined. `paper2017`: each
     sign by itself from its best plane, poses taken as they are."""
-    min_frames: int = 3
+    min_frames: Count = 3
     """Tracklets with fewer detections of the tracklet's shape are pruned."""
-    min_parallax_deg: float = 0.7
+    min_parallax_deg: Degrees = 0.7
     """`joint`: tracklets whose rays differ by less are pruned."""
-    min_parallax_alone_deg: float = 10.0
+    min_parallax_alone_deg: Degrees = 10.0
     """`paper2017`: the same of signs fitted one by one, which what drifts between the views moves the further the less their
     rays differ."""
-    max_distance_m: float = 80.0
+    max_distance_m: Length = 80.0
     """Tracklets whose closest view is further away are pruned."""
-    max_noise_scale: float = 3.9
+    max_noise_scale: Deviations = 3.9
     """`joint`: tracklets whose views are noisier, as a multiple of the noise expected, are pruned."""
-    min_inlier_share: float = 0.5
+    min_inlier_share: Share = 0.5
     """Tracklets of whose views fewer agree with the sign are pruned."""
-    max_sigma_m: float = 1.5
+    max_sigma_m: Sigma = 1.5
     """Tracklets whose centre has a larger standard deviation in any direction are pruned."""
-    doubtful_frames: int = 10
+    doubtful_frames: Count = 10
     """Tracklets with fewer views in agreement must be better placed than others: false detections come in short runs."""
-    max_doubtful_sigma_m: float = 0.5
+    max_doubtful_sigma_m: Sigma = 0.5
     """Largest standard deviation of those."""
-    size_m: tuple[float, float] = (0.1, 16.5)
+    size_m: Span = (0.1, 16.5)
     """Smallest and largest plausible width and height: a board above four lanes of 3.75 m is 15 m wide, and what is found
     of it may be a tenth more."""
-    min_side_m: float = 0.25
+    min_side_m: Length = 0.25
     """Smallest plausible larger side: false detections that slide through the image of a creeping car look like tiny
     plates before the lens."""
-    confident_frames: float = 4.0
+    confident_frames: Factor = 4.0
     """Views in agreement, weighted by their scores, at which the confidence reaches 1 - 1/e."""
     start: SignStartConfig = field(default_factory=SignStartConfig)
     """`joint`: where the fits begin."""
@@ -86,6 +97,7 @@ class SignTriangulationConfig:
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from crowdmap_torch.io.atomic import atomic_folder
 from crowdmap_torch.io.documents import write_json
+from crowdmap_torch.ranges import Count, Seed, Settings
 from crowdmap_torch.simulate import faults, files, lane_perception, sign_detections
 from crowdmap_torch.simulate.lane_perception import LaneDetectionConfig, LaneRows, detect_lanes
 from crowdmap_torch.simulate.positioning import (
@@ -36,7 +37,7 @@ DETECTION_PRESETS = {
 
 
 @dataclass(frozen=True)
-class SimulationConfig:
+class SimulationConfig(Settings):
     """Everything that decides a dataset; the same configuration gives the same bytes."""
 
     world: WorldConfig = field(default_factory=lambda: WORLD_PRESETS["suburb"])
@@ -45,18 +46,12 @@ class SimulationConfig:
     positioning: PositioningConfig = field(default_factory=PositioningConfig)
     signs: SignDetectionConfig = field(default_factory=SignDetectionConfig)
     lanes: LaneDetectionConfig = field(default_factory=LaneDetectionConfig)
-    journeys: int = 25
-    seed: int = 0
-    world_seed: int | None = None
+    journeys: Count = 25
+    seed: Seed = 0
+    world_seed: Seed | None = None
     """Seed of the world alone, `seed` if not given: other journeys in the same world."""
     bad_drives: tuple[str, ...] = ()
     """One journey is spoilt for each of these `faults.KINDS`."""
-
-    def __post_init__(self) -> None:
-        if self.journeys < 1 or self.rig.rigs < 1:
-            raise ValueError(
-                f"{self.journeys} journeys with {self.rig.rigs} rigs: expected at least one of each"
-            )
 
 
 @dataclass(frozen=True)

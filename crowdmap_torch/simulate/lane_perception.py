@@ -9,6 +9,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from crowdmap_torch.geometry.camera import Camera, project
+from crowdmap_torch.ranges import (
+    CountOrNone,
+    CountSpan,
+    LengthOrNone,
+    PixelsOrNone,
+    PixelsSpan,
+    Rate,
+    SecondsSpan,
+    Settings,
+    Share,
+    Span,
+)
 from crowdmap_torch.simulate.markers import Markers
 from crowdmap_torch.simulate.vehicle import Drive
 from crowdmap_torch.simulate.worlds import World
@@ -20,35 +32,35 @@ _CHUNK_FRAMES = 4000
 
 
 @dataclass(frozen=True)
-class LaneDetectionConfig:
+class LaneDetectionConfig(Settings):
     """What the lane detector sees and what it gets wrong."""
 
-    lane_near_m: tuple[float, float] = (5.0, 8.0)
+    lane_near_m: Span = (5.0, 8.0)
     """Least and largest distance ahead of a detection's first point."""
-    lane_far_m: tuple[float, float] = (28.0, 45.0)
+    lane_far_m: Span = (28.0, 45.0)
     """Least and largest distance ahead of its last point."""
-    lane_points: tuple[int, int] = (8, 20)
+    lane_points: CountSpan = (8, 20)
     """Fewest and most points of a marker without gaps."""
-    lane_noise_px: float = 0.7
+    lane_noise_px: PixelsOrNone = 0.7
     """1-sigma of each point in u and in v."""
-    lane_common_noise_px: float = 0.0
+    lane_common_noise_px: PixelsOrNone = 0.0
     """1-sigma of a sideways shift that all points of a detection share."""
-    max_lanes: int = 5
+    max_lanes: CountOrNone = 5
     """Most markers of a frame, the nearest ones."""
-    lane_side_m: float = 9.0
+    lane_side_m: LengthOrNone = 9.0
     """Markers farther to the side are not seen."""
-    missed_lanes: float = 0.08
-    lane_occlusions_per_km: float = 2.0
+    missed_lanes: Share = 0.08
+    lane_occlusions_per_km: Rate = 2.0
     """Bursts in which a vehicle ahead hides the markers of one frame after another."""
-    lane_occlusion_s: tuple[float, float] = (0.5, 3.0)
-    lane_point_outliers: float = 0.03
+    lane_occlusion_s: SecondsSpan = (0.5, 3.0)
+    lane_point_outliers: Share = 0.03
     """Share of single points that lie somewhere else."""
-    lane_outlier_px: tuple[float, float] = (6.0, 50.0)
-    wrong_lane_type: float = 0.04
-    null_lane_type: float = 0.05
-    merged_lanes: float = 0.01
+    lane_outlier_px: PixelsSpan = (6.0, 50.0)
+    wrong_lane_type: Share = 0.04
+    null_lane_type: Share = 0.05
+    merged_lanes: Share = 0.01
     """Share of detections that begin on one marker and end on another."""
-    false_lanes: float = 0.01
+    false_lanes: Share = 0.01
     """Seams and tar lines, as a share of the true detections."""
 
 

@@ -10,36 +10,37 @@ from jaxtyping import Float
 from scipy.signal import lfilter
 
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.ranges import Degrees, Factor, LengthOrNone, Offset, Settings
 
 _DRIFT_STEP_M = 0.1
 """Way between the samples of a drift."""
 
 
 @dataclass(frozen=True)
-class PositioningConfig:
+class PositioningConfig(Settings):
     """Errors of poses; every sigma is per axis and stationary."""
 
-    bias_e_m: float = 0.30
+    bias_e_m: LengthOrNone = 0.30
     """1-sigma of a journey's constant bias to the east."""
-    bias_n_m: float = 0.30
-    bias_u_m: float = 0.42
-    drift_m: float = 0.25
+    bias_n_m: LengthOrNone = 0.30
+    bias_u_m: LengthOrNone = 0.42
+    drift_m: LengthOrNone = 0.25
     """1-sigma of the Ornstein-Uhlenbeck drift of the position, east, north and up alike."""
-    drift_length_m: float = 150.0
+    drift_length_m: LengthOrNone = 150.0
     """Distance travelled over which its correlation falls to 1/e."""
-    drift_rot_deg: float = 0.15
+    drift_rot_deg: Degrees = 0.15
     """1-sigma of the drift of the rotation about each axis of the link."""
-    drift_rot_length_m: float = 100.0
-    white_e_m: float = 0.015
+    drift_rot_length_m: LengthOrNone = 100.0
+    white_e_m: LengthOrNone = 0.015
     """1-sigma of the noise from frame to frame, which goes on at a standstill."""
-    white_n_m: float = 0.015
-    white_u_m: float = 0.02
-    white_rot_deg: float = 0.02
-    shared_bias_e_m: float = 0.0
+    white_n_m: LengthOrNone = 0.015
+    white_u_m: LengthOrNone = 0.02
+    white_rot_deg: Degrees = 0.02
+    shared_bias_e_m: Offset = 0.0
     """A bias that all journeys share; nobody can average it away."""
-    shared_bias_n_m: float = 0.0
-    shared_bias_u_m: float = 0.0
-    sigma_scale: float = 1.0
+    shared_bias_n_m: Offset = 0.0
+    shared_bias_u_m: Offset = 0.0
+    sigma_scale: Factor = 1.0
     """What the module's own sigmas are multiplied with; other than 1 they are wrong."""
     sigmas: bool = True
     """False: the sigma columns are left out."""

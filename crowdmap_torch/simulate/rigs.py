@@ -9,25 +9,26 @@ import torch
 from jaxtyping import Float
 
 from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.ranges import Angle, Count, Focal, LengthOrNone, Settings, Side
 
 R_FORWARD_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Axes of a camera that looks straight ahead, in the vehicle's (forward, left, up)."""
 
 
 @dataclass(frozen=True)
-class RigConfig:
+class RigConfig(Settings):
     """The fleet's cameras."""
 
-    rigs: int = 2
+    rigs: Count = 2
     """Different rigs in the fleet; the first has no mount file, the others have one."""
     camera: str = "brown"
     """`brown`, `pinhole` or `fisheye`."""
-    focal_px: float = 1000.0
+    focal_px: Focal = 1000.0
     """Focal length; each rig's differs by up to 3 %. A fisheye's is 0.7 times as long."""
-    width: int = 1280
-    height: int = 800
-    camera_height_m: float = 1.45
-    camera_pitch_deg: float = 1.0
+    width: Side = 1280
+    height: Side = 800
+    camera_height_m: LengthOrNone = 1.45
+    camera_pitch_deg: Angle = 1.0
     """How far the camera looks down; each rig's differs by up to half a degree."""
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from crowdmap_torch.ranges import Angle, Degrees, LengthOrNone, Settings, Share
+
 SPACING_M = 0.1
 """Distance between samples of a centre line; its chords are off a 15 m curve by under 0.1 mm."""
 
@@ -79,18 +81,18 @@ class Road:
 
 
 @dataclass(frozen=True)
-class RoadShape:
+class RoadShape(Settings):
     """How much a road turns, climbs and leans; each is a sum of waves of random phase."""
 
-    heading_deg: float = 20.0
+    heading_deg: Angle = 20.0
     """Amplitude of the heading; curves are `heading / wavelength` sharp."""
-    heading_wavelength_m: float = 400.0
-    grade: float = 0.02
+    heading_wavelength_m: LengthOrNone = 400.0
+    grade: Share = 0.02
     """Largest slope, metres per metre."""
-    grade_wavelength_m: float = 300.0
-    bank_deg: float = 1.5
+    grade_wavelength_m: LengthOrNone = 300.0
+    bank_deg: Degrees = 1.5
     """Largest bank."""
-    bank_wavelength_m: float = 250.0
+    bank_wavelength_m: LengthOrNone = 250.0
 
 
 def open_road(shape: RoadShape, length_m: float, rng: np.random.Generator) -> Road:

@@ -7,51 +7,61 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from crowdmap_torch.ranges import (
+    Degrees,
+    PixelsOrNone,
+    PixelsSpan,
+    Rate,
+    SecondsSpan,
+    Settings,
+    Share,
+    Span,
+)
 from crowdmap_torch.simulate.signposts import CODES, PANEL_CODES
 
 
 @dataclass(frozen=True)
-class SignDetectionConfig:
+class SignDetectionConfig(Settings):
     """What the sign detector sees and what it gets wrong."""
 
-    range_m: tuple[float, float] = (12.0, 80.0)
+    range_m: Span = (12.0, 80.0)
     """Nearest and farthest depth of a sign that is detected; with the `paper` positioning and a
     nearest depth of 12 m a plain average of 25 journeys has the paper's errors (8 m: a fifth less)."""
-    min_box_px: float = 12.0
+    min_box_px: PixelsOrNone = 12.0
     """Smallest larger side of a sign's box."""
-    view_angle_deg: float = 75.0
+    view_angle_deg: Degrees = 75.0
     """Largest angle between a sign's normal and the ray to it."""
-    pixel_noise_px: float = 0.55
+    pixel_noise_px: PixelsOrNone = 0.55
     """1-sigma of each corner in u and in v, for a large box."""
-    small_box_px: float = 12.0
+    small_box_px: PixelsOrNone = 12.0
     """Box at which the noise is 1.41 times as large: `noise * sqrt(1 + (small_box / box)^2)`."""
-    common_noise_px: float = 0.0
+    common_noise_px: PixelsOrNone = 0.0
     """1-sigma of a shift that all corners of a detection share."""
-    missed: float = 0.06
+    missed: Share = 0.06
     """Share of single detections that are missing."""
-    occlusions: float = 0.15
+    occlusions: Share = 0.15
     """Probability that a sign is hidden for a while in a journey."""
-    occlusion_s: tuple[float, float] = (0.3, 1.5)
-    outliers: float = 0.01
+    occlusion_s: SecondsSpan = (0.3, 1.5)
+    outliers: Share = 0.01
     """Share of detections with one or all corners far off."""
-    outlier_px: tuple[float, float] = (5.0, 40.0)
-    wrong_shape: float = 0.01
-    duplicates: float = 0.005
+    outlier_px: PixelsSpan = (5.0, 40.0)
+    wrong_shape: Share = 0.01
+    duplicates: Share = 0.005
     """Share of detections that come twice in their frame."""
-    ghosts_per_frame: float = 0.02
+    ghosts_per_frame: Rate = 0.02
     """False detections of a single frame."""
-    ghost_runs_per_frame: float = 0.002
+    ghost_runs_per_frame: Rate = 0.002
     """False detections that last 3 to 8 frames and move through the image."""
-    vehicle_signs_per_frame: float = 0.0002
+    vehicle_signs_per_frame: Rate = 0.0002
     """Signs on the back of vehicles ahead: they stand still in the image for seconds."""
-    wrong_code: float = 0.02
-    null_code: float = 0.1
+    wrong_code: Share = 0.02
+    null_code: Share = 0.1
     """Share of the detections whose code was not read."""
-    track_switches: float = 0.005
+    track_switches: Share = 0.005
     """Probability per detection that a track number changes without need."""
-    track_errors: float = 0.01
+    track_errors: Share = 0.01
     """Share of the detections that carry another sign's track number."""
-    null_track: float = 0.03
+    null_track: Share = 0.03
 
 
 DAY = SignDetectionConfig()

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.ranges import Angle, Degrees, LengthOrNone, Rate, Settings, Share, Span
 from crowdmap_torch.simulate.roads import Road
 
 CODES: dict[str, tuple[str, ...]] = {
@@ -33,33 +34,33 @@ PANEL_CODES = ("US:E1-5", "US:E5-1", "US:E6-2")
 
 
 @dataclass(frozen=True)
-class SignConfig:
+class SignConfig(Settings):
     """Where signs stand and how they look."""
 
-    posts_per_km: float = 32.0
+    posts_per_km: Rate = 32.0
     """Posts for the traffic of one direction."""
-    shared_share: float = 0.25
+    shared_share: Share = 0.25
     """Share of the posts that carry two or three signs, 0.7 m apart."""
-    opposite_share: float = 0.25
+    opposite_share: Share = 0.25
     """Posts for oncoming traffic, as a share of `posts_per_km`."""
-    back_to_back_share: float = 0.0
+    back_to_back_share: Share = 0.0
     """Share of the posts that carry a sign on their back too."""
-    gantries_per_km: float = 0.0
-    wide_boards_per_km: float = 0.0
+    gantries_per_km: Rate = 0.0
+    wide_boards_per_km: Rate = 0.0
     """Single boards across all lanes."""
-    wide_board_m: tuple[float, float] = (9.0, 15.0)
+    wide_board_m: Span = (9.0, 15.0)
     """Least and largest width of those."""
-    beside_m: tuple[float, float] = (1.5, 4.5)
+    beside_m: Span = (1.5, 4.5)
     """Least and largest distance of a post from the edge of the road."""
-    left_share: float = 0.15
+    left_share: Share = 0.15
     """Share of the posts on the left of their traffic."""
-    yaw_deg: float = 4.0
+    yaw_deg: Angle = 4.0
     """1-sigma of a sign's turn about the vertical away from square to the road."""
-    tilt_deg: float = 1.5
+    tilt_deg: Degrees = 1.5
     """1-sigma of its lean forwards and of its roll."""
-    null_code_share: float = 0.15
+    null_code_share: Share = 0.15
     """Share of the signs whose traffic-sign code nobody knows."""
-    stack_m: float = 0.7
+    stack_m: LengthOrNone = 0.7
     """Distance between the centres of signs on a shared post."""
 
 

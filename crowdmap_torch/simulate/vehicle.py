@@ -8,6 +8,19 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.signal import lfilter
 
+from crowdmap_torch.ranges import (
+    Angle,
+    Degrees,
+    Factor,
+    FrameRate,
+    LengthOrNone,
+    Rate,
+    Seconds,
+    SecondsSpan,
+    Settings,
+    Share,
+    Speed,
+)
 from crowdmap_torch.simulate.rigs import SimulatedRig
 from crowdmap_torch.simulate.worlds import World
 
@@ -16,40 +29,40 @@ _STEP_M = 0.5
 
 
 @dataclass(frozen=True)
-class VehicleConfig:
+class VehicleConfig(Settings):
     """How cars are driven and sprung."""
 
-    frame_rate_hz: float = 15.0
-    speed_variation: float = 0.12
+    frame_rate_hz: FrameRate = 15.0
+    speed_variation: Share = 0.12
     """Amplitude of the speed's slow ups and downs, as a share of it."""
-    acceleration: float = 1.5
+    acceleration: Speed = 1.5
     """Largest, in both directions [m/s^2]."""
-    lateral_acceleration: float = 2.5
+    lateral_acceleration: Speed = 2.5
     """What drivers bear in a curve [m/s^2]."""
-    stop_probability: float = 0.4
+    stop_probability: Share = 0.4
     """That a traffic light is red."""
-    stop_s: tuple[float, float] = (3.0, 12.0)
+    stop_s: SecondsSpan = (3.0, 12.0)
     """Shortest and longest wait at a light."""
-    lane_changes_per_km: float = 1.0
-    wander_m: float = 0.25
+    lane_changes_per_km: Rate = 1.0
+    wander_m: LengthOrNone = 0.25
     """Amplitude of the sway within a lane."""
-    keeping_m: float = 0.12
+    keeping_m: LengthOrNone = 0.12
     """1-sigma of a driver's constant distance from the middle of the lane."""
-    load_deg: float = 1.0
+    load_deg: Angle = 1.0
     """Largest constant pitch of a loaded body; each journey has its own."""
-    load_roll_deg: float = 0.3
-    load_height_m: float = 0.02
-    vibration_deg: float = 0.12
+    load_roll_deg: Angle = 0.3
+    load_height_m: LengthOrNone = 0.02
+    vibration_deg: Degrees = 0.12
     """1-sigma of the body's fast pitch; its roll has half of that."""
-    squat_deg: float = 0.2
+    squat_deg: Degrees = 0.2
     """Steady pitch of the body for 1 m/s^2 of acceleration."""
-    laps: float = 1.0
+    laps: Factor = 1.0
     """How often a closed block is driven round."""
-    start_spread_m: float = 30.0
+    start_spread_m: LengthOrNone = 30.0
     """Journeys start up to this far behind one another."""
-    frame_loss: float = 0.001
+    frame_loss: Share = 0.001
     """Share of single frames that are missing; their numbers are left out."""
-    gap_s: float = 0.0
+    gap_s: Seconds = 0.0
     """One gap of this length in the frames, at a random place."""
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
+from crowdmap_torch.ranges import LengthOrNone, Range, Rate, Settings, Span, Speed
 from crowdmap_torch.simulate.markers import Markers, Strip, lay_markers
 from crowdmap_torch.simulate.roads import Road, RoadShape, block_road, open_road
 from crowdmap_torch.simulate.signposts import SignConfig, WorldSigns, put_up_signs
@@ -15,39 +17,41 @@ RUN_IN_M = 40.0
 """An open road is this much longer than a drive: journeys start at differing stations."""
 
 
+Lanes = Annotated[int, Range(0, 20, "lanes of a road")]
+
+
 @dataclass(frozen=True)
-class WorldConfig:
+class WorldConfig(Settings):
     """The kind of world: how long, how wide, how often."""
 
     name: str
-    length_m: float = 1000.0
+    length_m: Annotated[float, Range(50, 1e6, "metres of a drive: 50 m to 1,000 km")] = 1000.0
     """Length of one drive; a block's circumference."""
     closed: bool = False
     road: RoadShape = field(default_factory=RoadShape)
     signs: SignConfig = field(default_factory=SignConfig)
-    lane_width_m: tuple[float, float] = (3.3, 3.6)
+    lane_width_m: Span = (3.3, 3.6)
     """Least and largest; one road has one width."""
-    lanes_ahead: int = 2
+    lanes_ahead: Lanes = 2
     """Lanes in the direction of the stations."""
-    lanes_back: int = 2
+    lanes_back: Lanes = 2
     """Lanes against it; none on one side of a divided highway."""
-    dash_m: float = 4.0
+    dash_m: LengthOrNone = 4.0
     """Painted part of a dashed marker."""
-    gap_m: float = 5.0
-    lights_per_km: float = 2.0
+    gap_m: LengthOrNone = 5.0
+    lights_per_km: Rate = 2.0
     """Traffic lights, where cars may have to stop."""
-    crossings_per_km: float = 0.0
+    crossings_per_km: Rate = 0.0
     """Roads that cross, whose markers run square to ours."""
-    exits_per_km: float = 0.0
+    exits_per_km: Rate = 0.0
     """Exits on the right: the edge marker splits off."""
-    speed_mps: float = 12.0
+    speed_mps: Speed = 12.0
     """Cruising speed of the cars there."""
     both_directions: bool = False
     """True: every second journey drives against the stations."""
 
     def __post_init__(self) -> None:
-        if not 50 <= self.length_m <= 1e6:
-            raise ValueError(f"length of a drive {self.length_m:g} m: expected 50 m to 1000 km")
+        super().__post_init__()
         if self.lanes_ahead < 1 or (self.both_directions and self.lanes_back < 1):
             raise ValueError("no lane to drive in: expected at least one in each driven direction")
 

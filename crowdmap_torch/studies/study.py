@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crowdmap_torch.processes.interrupts import keeping
+from crowdmap_torch.ranges import Workers, argument
 from crowdmap_torch.studies.chapter import Chapter, Table, write_chapters
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.numbers import seconds
@@ -54,7 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick", action="store_true", help="a tiny world: only shows that it runs"
     )
-    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="N")
+    parser.add_argument(
+        "--processes", type=argument(Workers), default=os.cpu_count() or 1, metavar="N"
+    )
     parser.add_argument("--real", type=Path, metavar="DIR", help="folder of kitti-signs")
     parser.add_argument(
         "--report-only", action="store_true", help="tables and plots of what is done, no more work"

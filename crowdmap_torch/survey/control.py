@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.ranges import Length, Settings
 from crowdmap_torch.survey.matching import SurveyMatchConfig, match_to_survey
 from crowdmap_torch.tables import Rows, Signs, SurveySigns
 
@@ -23,12 +24,12 @@ class ControlSigns(Rows):
 
 
 @dataclass(frozen=True)
-class ControlConfig:
+class ControlConfig(Settings):
     """Which sign of the map a surveyed one is."""
 
     match: SurveyMatchConfig = field(default_factory=SurveyMatchConfig)
     """Optimal assignment to the cluster heads, as in METRICS.md."""
-    agreement_m: float = 1.0
+    agreement_m: Length = 1.0
     """A match further than this from where the others put it is none."""
 
 

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from crowdmap_torch.clustering.neighbours import pairs_between
+from crowdmap_torch.ranges import Cost, Length, Settings
 from crowdmap_torch.tables import Signs, SurveySigns
 
 DUPLICATE, FALSE, MATCHED = -1, -2, 0
@@ -21,16 +22,16 @@ a survey row."""
 
 
 @dataclass(frozen=True)
-class SurveyMatchConfig:
+class SurveyMatchConfig(Settings):
     """How signs of a map are matched to those of a survey."""
 
-    gate_m: float = 3.0
+    gate_m: Length = 3.0
     """Centres further apart are never one sign (2 m on kitti-signs)."""
-    shape_penalty_m: float = 0.75
+    shape_penalty_m: Cost = 0.75
     """Its square is added to the squared distance where the shapes differ."""
-    facing_penalty_m: float = 1.5
+    facing_penalty_m: Cost = 1.5
     """Its square is added where the map sign faces away from where the true one faces."""
-    duplicate_radius_m: float = 3.0
+    duplicate_radius_m: Length = 3.0
     """An unmatched map sign this near to a true sign is a duplicate, else it is false."""
 
 

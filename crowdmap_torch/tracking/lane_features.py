@@ -10,6 +10,7 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.epipolar import epipolar_cost, fundamental
+from crowdmap_torch.ranges import Cost, Count, Factor, Length, Pixels, Settings, Sigma, Span
 from crowdmap_torch.tables import LaneDetections, LanePoints, Rig, Rows
 
 METHODS = ("ground", "epipolar")
@@ -18,34 +19,35 @@ SAMPLES = 6
 
 
 @dataclass(frozen=True)
-class LaneAssociationConfig:
+class LaneAssociationConfig(Settings):
     """How lane detections become tracklets (IV-A)."""
 
     method: str = "ground"
     """`ground`: sideways distance on the calibrated road plane; `epipolar`: the paper's cost of an image line."""
-    window_frames: int = 25
+    window_frames: Count = 25
     """Tracklets silent for longer are ignored: the association window."""
-    unmatched_cost: float = 9.0
+    unmatched_cost: Cost = 9.0
     """`ground`: a detection that costs more, mean square in standard deviations, starts a tracklet."""
-    max_epipolar_px: float = 12.0
+    max_epipolar_px: Pixels = 12.0
     """`epipolar`: root mean square epipolar distance beyond which a detection starts a tracklet."""
-    sigma_m: float = 0.2
+    sigma_m: Sigma = 0.2
     """Sideways noise of a line near the car."""
-    sigma_per_m: float = 0.012
+    sigma_per_m: Factor = 0.012
     """Growth of that noise with the distance ahead."""
-    turn_sigma_per_m: float = 0.03
+    turn_sigma_per_m: Factor = 0.03
     """Growth of the noise beyond the end of the line that is compared with."""
-    max_beyond_m: float = 25.0
+    max_beyond_m: Length = 25.0
     """Lines with a longer gap between them, along the road, are not compared."""
-    type_penalty: float = 2.0
+    type_penalty: Cost = 2.0
     """Cost of another type where both are known."""
-    reach_m: tuple[float, float] = (2.0, 45.0)
+    reach_m: Span = (2.0, 45.0)
     """Points nearer or further ahead on the road plane are left out."""
-    chunk_pairs: int = 1 << 13
+    chunk_pairs: Count = 1 << 13
     """Pairs whose costs are computed at once."""
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 

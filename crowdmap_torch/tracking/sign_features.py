@@ -11,6 +11,7 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import correspondence, polygon, se3
 from crowdmap_torch.geometry.epipolar import fundamental
+from crowdmap_torch.ranges import Cost, Count, Deviations, Length, Pixels, Settings, Sigma
 from crowdmap_torch.tables import Rows, SignDetections
 
 METHODS = ("predicted", "epipolar")
@@ -20,48 +21,49 @@ CLEAR_ORDER = 0.5
 
 
 @dataclass(frozen=True)
-class SignAssociationConfig:
+class SignAssociationConfig(Settings):
     """How sign detections are linked across frames (IV-A)."""
 
     method: str = "predicted"
     """`predicted`: the epipolar cost to the last measurement, and the distance to where the tracklet is predicted to appear
     and how large; `epipolar`: the epipolar cost alone, as in the paper, of detections of its shape near the prediction."""
-    window_frames: int = 25
+    window_frames: Count = 25
     """Association window w: tracklets silent for longer are ignored [frames]."""
     corner_matching: str = "cyclic"
     """Vertices are matched by the best cyclic `shift`; `free`: by any assignment, as the paper words it (slow)."""
-    max_epipolar_px: float = 6.0
+    max_epipolar_px: Pixels = 6.0
     """A detection starts a new tracklet where the root mean epipolar cost over vertices exceeds this [px]."""
-    max_distance: float = 5.0
+    max_distance: Deviations = 5.0
     """... or where it is this many standard deviations from every prediction: implausible motion."""
-    unmatched_cost: float = 24.0
+    unmatched_cost: Cost = 24.0
     """What leaving a detection and a tracklet unmatched costs, as minus twice a log-likelihood; method `predicted`."""
-    sure_after: int = 3
+    sure_after: Count = 3
     """From so many measurements on, a tracklet that agrees with its prediction may break the epipolar gate: the last
     measurement may have been the wrong one; method `predicted`."""
-    shape_penalty: float = 6.0
+    shape_penalty: Cost = 6.0
     """Added to the cost where a detection's shape is not the tracklet's shape by vote."""
-    young_penalty: float = 4.0
+    young_penalty: Cost = 4.0
     """Added to the cost of a tracklet with one measurement, half of it with two, and so on: of two tracklets of one sign,
     one begun by a second detection in a frame, the older goes on."""
-    track_bonus: float = 2.0
+    track_bonus: Cost = 2.0
     """Taken off where the perception module's track number agrees: a hint, which may be wrong."""
-    sigma_px: float = 1.0
+    sigma_px: Pixels = 1.0
     """Noise of a sign's centre and of half its height [px]."""
-    sigma_relative: float = 0.04
+    sigma_relative: Sigma = 0.04
     """Further noise of the two, as a share of the sign's height."""
-    typical_height_m: float = 0.75
+    typical_height_m: Length = 0.75
     """Median height of signs; gives a new tracklet its first depth."""
-    sigma_log_height: float = 0.7
+    sigma_log_height: Sigma = 0.7
     """Spread of the logarithm of the height of signs."""
-    min_depth_m: float = 1.0
+    min_depth_m: Length = 1.0
     """Tracklets predicted nearer than this, or behind the camera, are not matched."""
-    max_depth_m: float = 500.0
+    max_depth_m: Length = 500.0
     """Nor are those whose depth would exceed this."""
-    chunk_pairs: int = 1 << 13
+    chunk_pairs: Count = 1 << 13
     """Pairs whose costs are computed at once; bounds the memory."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"sign association method {self.method!r}; expected one of {METHODS}")
         if self.corner_matching not in CORNER_MATCHINGS:

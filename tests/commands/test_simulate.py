@@ -28,10 +28,26 @@ def test_every_number_of_a_preset_is_an_option(tmp_path: Path, capsys):
 
 
 @pytest.mark.parametrize(
-    "options", [["--journeys", "0"], ["--bad-drives", "flat-tyre"], ["--camera", "lomo"]]
+    "options",
+    [
+        ["--journeys", "0"],
+        ["--seed", "9" * 5000],
+        ["--seed", "-1"],
+        ["--length-m", "nan"],
+        ["--pixel-noise-px", "inf"],
+        ["--frame-rate-hz", "0"],
+        ["--range-m", "80", "12"],
+        ["--bad-drives", "flat-tyre"],
+        ["--camera", "lomo"],
+    ],
+    ids=lambda options: " ".join(options)[:30],
 )
 def test_wrong_options_are_one_line_and_exit_code_2(tmp_path: Path, capsys, options):
-    assert simulate(tmp_path / "data", "--world", "street", *options) == 2
+    try:
+        code = simulate(tmp_path / "data", "--world", "street", *options)
+    except SystemExit as ended:
+        code = ended.code
+    assert code == 2
     error = capsys.readouterr().err
     assert error.startswith("crowdmap simulate: ") and error.count("\n") == 1
     assert not (tmp_path / "data").exists()

@@ -167,7 +167,7 @@ def test_an_existing_folder_is_refused_unless_it_may_be_replaced(tmp_path: Path)
 
 
 def test_a_configuration_without_journeys_is_refused():
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="journeys: expected 1 to"):
         SimulationConfig(journeys=0)
     with pytest.raises(ValueError, match="length"):
         replace(STREET, length_m=-5.0)
