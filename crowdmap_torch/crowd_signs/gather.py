@@ -11,6 +11,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, pairs_within
 from crowdmap_torch.geometry.trajectory import station as along_track
+from crowdmap_torch.noise.pose_prior import stated_sigmas
 from crowdmap_torch.tables import Journey, Signs, Tracklets
 
 _FASTEST_MPS = 70.0
@@ -99,8 +100,9 @@ def gather_signs(
         middle.append((corners.amin(1) + corners.amax(1)) / 2)
         extent.append((corners.amax(1) - corners.amin(1)).amax(1))
         frame_offset += journey.frame_count
-        if journey.sigma_position is not None:
-            sigma[j] = journey.sigma_position.median(0).values.clamp_min(0.05)
+        stated, _ = stated_sigmas(journey)
+        if stated is not None:
+            sigma[j] = stated.clamp_min(0.05)
         if journey.frame_count:
             step = (distance / path_step_m).floor()
             sampled = torch.cat((step.new_ones(1, dtype=torch.bool), step.diff() > 0))

@@ -21,6 +21,11 @@ from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
 from crowdmap_torch.tables import Journey
 
+LEAST_SIGMA_M = 1e-3
+"""What carrier phases leave under the open sky of a receiver that stands still: who states less states nothing."""
+LEAST_SIGMA_RAD = 1e-5
+"""Likewise of rotations: two seconds of arc, a theodolite's."""
+
 
 @dataclass(frozen=True)
 class PosePriorConfig(Settings):
@@ -288,6 +293,21 @@ def pose_prior(
     )
 
 
+def stated_sigmas(journey: Journey) -> tuple[Float[Tensor, " 3"] | None, Float[Tensor, ""] | None]:
+    """The module's own sigmas of position [m] and rotation [rad], the medians of its frames; None where it states none.
+
+    A sigma of zero, or below what any receiver or gyro can know of where it is, is no statement.
+    """
+    position, rotation = journey.sigma_position, journey.sigma_rotation
+    if position is not None:
+        position = position.median(0).values
+        position = position if bool((position >= LEAST_SIGMA_M).all()) else None
+    if rotation is not None:
+        rotation = rotation.median()
+        rotation = rotation if bool(rotation >= LEAST_SIGMA_RAD) else None
+    return position, rotation
+
+
 def _sigmas(
     journey: Journey, positioning: PositioningNoise, like: Tensor
 ) -> tuple[Float[Tensor, " 6"], Float[Tensor, " 6"]]:
@@ -297,12 +317,13 @@ def _sigmas(
     turn = like.new_tensor([positioning.rotation_sigma_rad] * 3)
     tilt = like.new_tensor([positioning.bias_sigma_rad] * 3)
     # The module gives the sigma of both together; of a small one the drift takes half.
-    if journey.sigma_position is not None:
-        total = journey.sigma_position.to(like).median(0).values.square().clamp_min(1e-6)
+    position, rotation = stated_sigmas(journey)
+    if position is not None:
+        total = position.to(like).square()
         drift = torch.minimum(drift.square(), total / 2).sqrt()
         bias = (total - drift.square()).sqrt()
-    if journey.sigma_rotation is not None:
-        total = journey.sigma_rotation.to(like).median().square().clamp_min(1e-10)
+    if rotation is not None:
+        total = rotation.to(like).square()
         tilt = torch.minimum(tilt.square(), total / 2).sqrt()
         turn = (total - tilt.square()).sqrt()
     return torch.cat((bias, tilt)), torch.cat((drift, turn))

@@ -11,7 +11,13 @@ from torch import Tensor
 from worlds.small_world import Builder
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.noise.pose_prior import DriftNodes, PosePrior, PosePriorConfig, pose_prior
+from crowdmap_torch.noise.pose_prior import (
+    DriftNodes,
+    PosePrior,
+    PosePriorConfig,
+    pose_prior,
+    stated_sigmas,
+)
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.linearize import linearize
 from crowdmap_torch.optim.problem import Problem, Variable, euclidean
@@ -192,3 +198,17 @@ def test_poses_of_the_prior_cost_nothing():
     for term in terms.values():
         residual = linearize(term, variables, values).residual
         assert residual.abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-300, 1e-4])
+def test_sigmas_that_nobody_can_have_are_as_good_as_none(sigma: float):
+    journey = Builder().drive("j", frames=4).journey
+    stated = replace(
+        journey,
+        sigma_position=torch.full((4, 3), sigma, dtype=torch.float64),
+        sigma_rotation=torch.full((4,), min(sigma, 1e-6), dtype=torch.float64),
+    )
+    assert stated_sigmas(stated) == (None, None)
+    sound = replace(stated, sigma_position=torch.tensor([[0.01, 0.3, 2.0]] * 4))
+    position, _ = stated_sigmas(sound)
+    assert position is not None and position.tolist() == pytest.approx([0.01, 0.3, 2.0])
