@@ -4,9 +4,10 @@ BIN := $(VENV)/bin
 # Touched when the install is complete: the second `make install` has nothing to do.
 STAMP := $(VENV)/.installed
 DEMO := demo
+MUTANTS := 10000
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-coverage lint format
+.PHONY: help install demo test soak test-coverage lint format
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 16
@@ -24,6 +25,10 @@ demo: $(STAMP)  ## simulate a street, map it, compare the map with its survey; e
 	rm -rf $(DEMO)/street
 	$(BIN)/crowdmap simulate $(DEMO)/street --world street --journeys 8 --seed 1
 	$(BIN)/crowdmap optimize $(DEMO)/street --out $(DEMO)/run --overwrite
+
+# Two cores: half of the seeds each. What fails stays in soak-failures/.
+soak: $(STAMP)  ## ten thousand destroyed data sets: no traceback, no hang, nothing lost without a word
+	$(BIN)/python scripts/soak.py --mutants $(MUTANTS) --processes 2
 
 # Each core has a process of its own, and files stay whole: their fixtures are made once. Annotations of shapes are checked.
 TESTS := CROWDMAP_CHECK_SHAPES=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist loadfile

@@ -35,6 +35,7 @@ FLOORS = (
     ("studies",),
     ("commands",),
     ("cli",),
+    ("soak",),
     ("__main__", "__init__"),
 )
 """Every room of the house, from the ground up; the modules of the root are rooms of their own."""

@@ -10,7 +10,7 @@ import pytest
 from architecture import FLOOR, NEIGHBOURS, functions, imports, modules, own_imports, room, tree
 
 PACKAGE = architecture.ROOT / architecture.PACKAGE
-SPEAKING = ("benchmark", "commands", "studies")
+SPEAKING = ("benchmark", "commands", "soak", "studies")
 """Rooms that print: benchmarks and studies are the inside of a command."""
 
 
