@@ -30,6 +30,7 @@ from crowdmap_torch.ranges import (
     Deviations,
     Factor,
     Length,
+    LengthOrNone,
     Pixels,
     Range,
     Settings,
@@ -103,7 +104,7 @@ class AdjustConfig(Settings):
     """Lane points are taken from frames this far apart."""
     points_per_detection: Count = 5
     """Most points of a lane detection that are used."""
-    max_ground_distance_m: Length = 25.0
+    max_ground_distance_m: LengthOrNone = 25.0
     """Lane points that meet the road further ahead are left out."""
     frame_spacing_m: Spacing = 0.25
     """Frames closer together than this (a car at a light) are thinned."""

@@ -146,23 +146,20 @@ def _refuse_off(path: Path, name: str, vector: Float[Tensor, "f k"]) -> None:
 
 
 def _read_labels(
-    path: Path, column: str, ids: Sequence[str], most: int
+    path: Path, column: str, ids: Sequence[str], least: int
 ) -> tuple[Int[Tensor, " r"], Bool[Tensor, " r"]]:
     """For each row of a detection file what it shows (-1 none), and whether it is an outlier."""
     sheet = Sheet(path, ("row", column), ("outlier",))
     rows_given = sheet.integers("row")
-    sheet.refuse(
-        (rows_given < 0) | (rows_given >= most),
-        lambda at: (
-            f"row {rows_given[at]} of the journey's file, which has {most}. "
-            "Is it another dataset's truth?"
-        ),
-    )
-    if len(np.unique(rows_given)) != most or len(sheet) != most:
+    if len(sheet) < least:
         raise sheet.fault(
-            f"{len(sheet)} rows for the {most} of the journey's {path.name}; expected a line for "
-            "each row. Is it another dataset's truth?"
+            f"{len(sheet)} rows, but the journey's {path.name} has {least}; expected a line for each "
+            "row. Is it another dataset's truth?"
         )
+    sheet.refuse(
+        np.sort(rows_given) != np.arange(len(sheet)),
+        lambda at: f"column 'row': expected each of 0 to {len(sheet) - 1} once",
+    )
     row = torch.from_numpy(rows_given)
     names = sheet.strings(column, optional=True)
     label = index_in(names, ids)

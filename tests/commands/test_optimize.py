@@ -542,7 +542,7 @@ def test_a_wrong_configuration_is_one_line(optimize, tiny_folder: Path, tmp_path
 
 def test_a_missing_configuration_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):
     said = optimize(tiny_folder, tmp_path / "run", "--config", str(tmp_path / "none.yaml"))
-    assert_refused(said, tmp_path / "run", "none.yaml", "cannot be read")
+    assert_refused(said, tmp_path / "run", "none.yaml", "the file is missing")
 
 
 def test_an_unknown_device_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):
