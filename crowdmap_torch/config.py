@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from crowdmap_torch.adjustment.bundle import AdjustConfig
+from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.crowd_lanes.cluster import LaneClusterConfig
 from crowdmap_torch.crowd_lanes.join import LaneJoinConfig
 from crowdmap_torch.crowd_signs.complete_tracks import CompleteTracksConfig

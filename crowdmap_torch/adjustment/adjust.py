@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from crowdmap_torch.adjustment.bundle import AdjustConfig, Bundle, Observations, Priors, Unknowns
+from crowdmap_torch.adjustment.bundle import Bundle, Observations, Priors, Unknowns
+from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes
 from crowdmap_torch.adjustment.observations import (

@@ -16,7 +16,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.adjustment.bundle import AdjustConfig, Bundle
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.evaluation.visibility import observable_signs
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.io.truth import JourneyTruth, Truth

@@ -13,8 +13,8 @@ from torch import Tensor
 from worlds.drives import signs_by_detection
 
 from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.adjustment.adjust import AdjustConfig
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
 from crowdmap_torch.adjustment.observations import frame_offsets
 from crowdmap_torch.evaluation.signs import SignFigures, evaluate_signs

@@ -1,0 +1,85 @@
+"""What bundle adjustment can be told (V-B)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from crowdmap_torch.noise.pose_prior import PosePriorConfig
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.ranges import (
+    Count,
+    CountOrNone,
+    Deviations,
+    Factor,
+    Length,
+    LengthOrNone,
+    Pixels,
+    Range,
+    Settings,
+    Sigma,
+    SigmaOrOff,
+    Spacing,
+)
+from crowdmap_torch.residuals.sign_prior import SignHabit
+
+
+@dataclass(frozen=True)
+class AdjustConfig(Settings):
+    """Bundle adjustment (V-B)."""
+
+    lm: lm.LmConfig = field(
+        default_factory=lambda: lm.LmConfig(
+            max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9, max_stretch=3.0
+        )
+    )
+    """The solver; its tolerance counts once the scales stand still."""
+    prior: PosePriorConfig = field(default_factory=PosePriorConfig)
+    """What the poses may be wrong by."""
+    tukey_c: Deviations = 4.685
+    """Residuals beyond this many standard deviations have no weight; the corners of a detection are judged together, by a
+    bound that is as efficient."""
+    sign_sigma_px: Pixels = 0.5
+    """Least standard deviation of a sign corner of a large box; more where the residuals say so."""
+    box_sigma: Sigma = 0.5
+    """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, as a share of them."""
+    habit: SignHabit = field(default_factory=SignHabit)
+    """What signs are like before anything is seen of them."""
+    size_classes_m: tuple[tuple[Length, Length], ...] = ()
+    """Widths and heights that signs are made in: one that is near such a size is drawn to it, others are not. None: sizes
+    are what the images say."""
+    size_class_sigma: Sigma = 0.005
+    """1-sigma of the width and height of signs about their class, as a share."""
+    innovation_chance: Annotated[float, Range(0, 0.99, "a chance: at 1 all detections go")] = 1e-5
+    """Detections further from what everything else foresees than normal noise brings them with this chance are given up;
+    0: none."""
+    lane_sigma_px: Pixels = 0.8
+    """Least standard deviation of a lane point across the marker."""
+    lane_correlation: Factor = 1.0
+    """Least factor on the lane points' sigma, as the points of one detection err together; more where the residuals
+    say so."""
+    lane_height_sigma_m: SigmaOrOff = 0.05
+    """How well the road under the car tells a marker's height."""
+    lane_gate_m: Length = 0.9
+    """Lane points further from every lane than this, before adjustment, are left out."""
+    lane_step_sigma_m: tuple[Sigma, Sigma, Sigma] = (0.2, 0.5, 0.3)
+    """How much the step from one control point to the next may change: along the marker, across it, upwards."""
+    lane_place_sigma_m: Sigma = 30.0
+    """Prior of a control point's place: only there to keep a marker that nothing holds."""
+    lane_slide_m: Length = 0.3
+    """How far a control point may about slide along its marker in one step of the solver."""
+    drift_spacing_m: Spacing = 1.0
+    """Stretch over which the drift of the poses is taken to stand still."""
+    keyframe_spacing_m: Spacing = 3.0
+    """Lane points are taken from frames this far apart."""
+    points_per_detection: Count = 5
+    """Most points of a lane detection that are used."""
+    max_ground_distance_m: LengthOrNone = 25.0
+    """Lane points that meet the road further ahead are left out."""
+    frame_spacing_m: Spacing = 0.25
+    """Frames closer together than this (a car at a light) are thinned."""
+    dense_unknowns: CountOrNone = 12000
+    """Unknowns of signs and lanes up to which their system is one dense matrix; larger ones are solved by conjugate
+    gradients, matrix-free, and their covariances estimated from samples."""
+    covariance_samples: Count = 64
+    """Samples of the map that such covariances are estimated from; their sigmas are then good to 9 %."""
