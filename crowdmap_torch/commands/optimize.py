@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 # Before torch: its threads then sleep while they wait, and do not spin. On a busy machine that is several times faster.
@@ -50,7 +51,7 @@ from crowdmap_torch.runs.folder import (
     refuse_overlap,
 )
 from crowdmap_torch.runs.metrics import metrics_of
-from crowdmap_torch.tables import Dataset, RejectedJourney, Survey, to_device
+from crowdmap_torch.tables import Dataset, RejectedJourney, Survey, SurveySigns, to_device
 
 EMPTY_MAP = 3
 """Exit code with `--strict` where a map was written without the signs or lanes that were detected."""
@@ -102,13 +103,9 @@ def _map(
     options: argparse.Namespace, folder: RunFolder, config: MapperConfig, device: torch.device
 ) -> int:
     with input_read():
-        with reading(config.reading, inside=options.dataset):
-            dataset = _load(options.dataset, device, strict=options.strict)
-            survey = read_survey_of(options.dataset, dataset.origin)
-            truth = read_truth_of(options.dataset, dataset, survey)
-        with reading(config.reading):
-            control = _read_control(options.control, dataset)
-        inputs = inputs_of(dataset, config, survey, truth, control, device=device)
+        given = _read(options, config, device)
+        dataset, survey, truth = given.dataset, given.survey, given.truth
+        inputs = inputs_of(dataset, config, survey, truth, given.control, device=device)
         kept = Checkpoint(folder.checkpoint, inputs)
         found = _take_up(kept, folder, len(dataset.journeys), device) if options.resume else Found()
     if found is None:
@@ -140,8 +137,7 @@ def _map(
 
         # ---- everything at once (section V-B) ----
         progress("bundle adjustment: building")
-        pins = None if control is None else control.signs.to(device)
-        bundle = mapper.build_bundle(journeys, maps, first, config, control=pins)
+        bundle = mapper.build_bundle(journeys, maps, first, config, control=given.pins(device))
         watch = Watch(log, survey, first.signs, first.lanes, every=options.log_every)
         if found.step is None:
             begun = adjust.start(bundle)
@@ -168,7 +164,7 @@ def _map(
         progress("errors and report")
         compared = None, None
         with _spared("figures"):
-            compared = _compared(result, config, survey, truth, folder, control)
+            compared = _compared(result, config, given, folder)
         progress.finish()
         missing = missing_findings(dataset, result, config)
         _tell(missing, dataset)
@@ -195,8 +191,27 @@ def _spared(what: str) -> Iterator[None]:
         print(f"looks wrong: no {what} could be made ({reason}); the map is whole", file=sys.stderr)
 
 
-def _read_control(folder: Path | None, dataset: Dataset) -> Survey | None:
-    return None if folder is None else read_survey_at(folder, dataset.origin)
+@dataclass(frozen=True)
+class _Given:
+    dataset: Dataset
+    survey: Survey | None
+    truth: Truth | None
+    control: Survey | None
+    """Surveyed signs that pin the map."""
+
+    def pins(self, device: torch.device) -> SurveySigns | None:
+        return None if self.control is None else self.control.signs.to(device)
+
+
+def _read(options: argparse.Namespace, config: MapperConfig, device: torch.device) -> _Given:
+    """What there is to map from, and to judge the map by."""
+    with reading(config.reading, inside=options.dataset):
+        dataset = _load(options.dataset, device, strict=options.strict)
+        survey = read_survey_of(options.dataset, dataset.origin)
+        truth = read_truth_of(options.dataset, dataset, survey)
+    with reading(config.reading):
+        control = options.control and read_survey_at(options.control, dataset.origin)
+    return _Given(dataset, survey, truth, control)
 
 
 def _load(folder: Path, device: torch.device, *, strict: bool) -> Dataset:
@@ -234,14 +249,10 @@ def _take_up(
 
 
 def _compared(
-    result: mapper.MapResult,
-    config: MapperConfig,
-    survey: Survey | None,
-    truth: Truth | None,
-    folder: RunFolder,
-    control: Survey | None,
+    result: mapper.MapResult, config: MapperConfig, given: _Given, folder: RunFolder
 ) -> tuple[MapFigures | None, MapFigures | None]:
     """Figures of the map, which are printed, and of that of the cluster heads, where there is a survey."""
+    survey, truth, control = given.survey, given.truth, given.control
     if survey is None:
         return None, None
     final, before = (
