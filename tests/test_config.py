@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+from jaxtyping import TypeCheckError
 
 from crowdmap_torch.config import MapperConfig, as_dict, config_hash, dump, load_config
 from crowdmap_torch.ranges import Range, hints
 
 ROOT = Path(__file__).parent.parent
+REFUSED = (ValueError, TypeCheckError)
+"""With `CROWDMAP_CHECK_SHAPES=1` what is of another type is refused before a range is looked at."""
 
 
 @pytest.fixture
@@ -195,12 +198,14 @@ def test_every_number_has_a_range_with_a_reason_and_holds_to_it(name: str):
     replace(inside, **{field: value})
     beyond = (math.nan, -math.inf, 10 * ranges[0].high + 1, ranges[0].low - 1)
     for number in (*beyond, *(() if ranges[0].or_infinite else (math.inf,))):
-        with pytest.raises(ValueError, match=field):
+        with pytest.raises(REFUSED, match=field):
             replace(inside, **{field: instead(value, number)})
 
 
 def test_what_is_no_configuration_is_refused_from_python_too():
-    with pytest.raises(ValueError, match="adjust: expected AdjustConfig"):
+    with pytest.raises(REFUSED, match="adjust: expected AdjustConfig|parameter 'adjust'"):
         MapperConfig(adjust={"tukey_c": 5.0})  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"seed: expected a whole number, found 1\.5"):
+    with pytest.raises(
+        REFUSED, match=r"seed: expected a whole number, found 1\.5|parameter 'seed'"
+    ):
         MapperConfig(seed=1.5)  # type: ignore[arg-type]
