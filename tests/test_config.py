@@ -203,7 +203,7 @@ def test_every_number_has_a_range_with_a_reason_and_holds_to_it(name: str):
 
 
 def test_what_is_no_configuration_is_refused_from_python_too():
-    with pytest.raises(REFUSED, match="adjust: expected AdjustConfig|parameter 'adjust'"):
+    with pytest.raises(REFUSED, match=r"adjust: expected AdjustConfig|parameter 'adjust'"):
         MapperConfig(adjust={"tukey_c": 5.0})  # type: ignore[arg-type]
     with pytest.raises(
         REFUSED, match=r"seed: expected a whole number, found 1\.5|parameter 'seed'"
