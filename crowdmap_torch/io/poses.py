@@ -55,7 +55,9 @@ def read_poses(path: Path) -> LinkPoses:
     _refuse_far(sheet, position)
     _refuse_leaps(sheet, frame, t_ns, position)
     quaternion = np.stack([sheet.numbers(name) for name in _QUATERNION], axis=-1)
-    length = np.sqrt(np.square(quaternion).sum(-1))
+    with np.errstate(over="ignore"):
+        # The length of what is far from a quaternion may well be infinite: it is refused below.
+        length = np.sqrt(np.square(quaternion).sum(-1))
     sheet.refuse(
         np.abs(length - 1) > UNIT_TOLERANCE,
         lambda row: (

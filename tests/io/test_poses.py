@@ -77,3 +77,10 @@ def test_frames_and_times_that_do_not_increase_are_refused_by_row(sound, column:
     path = sound.write() / "journeys" / "a" / "poses.parquet"
     with pytest.raises(InputError, match=rf"poses\.parquet: row 2: column '{column}': {rule}"):
         read_poses(path)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_quaternion_beyond_all_bounds_is_refused_in_one_line_alone(sound) -> None:
+    sound.journeys["a"].poses["qx"][2] = 1e300
+    (rejected,) = load_dataset(sound.write()).rejected
+    assert "row 2: quaternion qx qy qz qw has length inf" in rejected.reason
