@@ -54,7 +54,7 @@ def test_an_exit_is_one_more_marker():
 @pytest.mark.parametrize(
     ("changes", "rule"),
     [
-        ({"length_m": 10.0}, "expected 50 m to 1000 km"),
+        ({"length_m": 10.0}, "length_m: expected 50 to "),
         ({"lanes_ahead": 0}, "no lane to drive in"),
         ({"both_directions": True, "lanes_back": 0}, "at least one in each driven direction"),
     ],

@@ -29,13 +29,13 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_forty_destroyed_data_sets_break_nothing(tmp_path: Path) -> None:
+def test_destroyed_data_sets_break_nothing(tmp_path: Path) -> None:
     # In a process of its own: one with threads, as this one may be, is not to be forked.
     command = [
         sys.executable,
         str(ROOT / "scripts" / "soak.py"),
         "--mutants",
-        "40",
+        "24",
         "--mapped",
         "0.1",
     ]
@@ -47,7 +47,7 @@ def test_forty_destroyed_data_sets_break_nothing(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "40 mutants" in done.stdout and "0 failures" in done.stdout
+    assert "24 mutants" in done.stdout and "0 failures" in done.stdout
 
 
 def test_the_same_seed_destroys_the_same(good: Path, tmp_path: Path) -> None:

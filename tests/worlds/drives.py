@@ -17,13 +17,15 @@ from crowdmap_torch.simulate.worlds import WORLD_PRESETS
 from crowdmap_torch.tables import Journey, LaneDetections, LanePoints, Rig, SignDetections
 
 
-def write_tiny(out: Path, *, journeys: int = 3, frame_rate_hz: float = 8.0) -> Path:
+def write_tiny(
+    out: Path, *, journeys: int = 3, frame_rate_hz: float = 8.0, length_m: float = 120.0
+) -> Path:
     """A dataset of a short street with a few signs; returns `out`."""
     street = WORLD_PRESETS["street"]
     config = SimulationConfig(
         world=replace(
             street,
-            length_m=120.0,
+            length_m=length_m,
             lights_per_km=0.0,
             signs=replace(street.signs, posts_per_km=60.0),
         ),
