@@ -35,6 +35,7 @@ from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.maps import as_map
 from crowdmap_torch.lanes.reconstruct import LaneReport, reconstruct_lanes
 from crowdmap_torch.optim.levenberg_marquardt import LmState
+from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.processes.workers import Workers
 from crowdmap_torch.road.estimate import estimate_road
 from crowdmap_torch.signs.triangulate import SignReport, triangulate_signs
@@ -120,6 +121,7 @@ class MapResult:
     """Surveyed signs that pin the map."""
 
 
+@one_core_each()
 def build_map(
     dataset: Dataset,
     config: MapperConfig,
@@ -182,6 +184,7 @@ def _mapped(
             yield left[place], made
 
 
+@one_core_each()
 @torch.no_grad()
 def map_journey(journey: Journey, number: int, config: MapperConfig) -> JourneyMap:
     """Section IV: the signs and lanes of one journey, the `number`-th of the dataset."""
@@ -204,6 +207,7 @@ def map_journey(journey: Journey, number: int, config: MapperConfig) -> JourneyM
     )
 
 
+@one_core_each()
 @torch.no_grad()
 def first_map(
     journeys: Sequence[Journey], maps: Sequence[JourneyMap], config: MapperConfig
@@ -237,6 +241,7 @@ def first_map(
     )
 
 
+@one_core_each()
 def build_bundle(
     journeys: Sequence[Journey],
     maps: Sequence[JourneyMap],
@@ -263,6 +268,7 @@ def build_bundle(
     )
 
 
+@one_core_each()
 @torch.no_grad()
 def finish_map(
     dataset: Dataset,

@@ -123,7 +123,7 @@ class LaneDetections(Rows):
 
 @dataclass(frozen=True)
 class LanePoints(Rows):
-    """The points of all lane detections of one journey, those of one detection adjacent."""
+    """The points of all lane detections of one journey, those of one detection adjacent, from the image's bottom up."""
 
     detection: Int[Tensor, " p"]
     """Index into the journey's lane detections, not decreasing."""

@@ -34,6 +34,7 @@ from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend
+from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.residuals.lane import (
     lane_prior,
     lane_prior_jacobian,
@@ -142,6 +143,7 @@ def adjust(bundle: Bundle) -> lm.LmState:
     return state
 
 
+@one_core_each()
 @torch.no_grad()
 def start(bundle: Bundle) -> lm.LmState:
     """The state before the first step: lanes matched, scales as wide as the residuals show."""
@@ -202,6 +204,7 @@ def _kind(tensor: Tensor | None) -> str:
     return "missing" if tensor is None else f"{tensor.dtype} {list(tensor.shape)}"
 
 
+@one_core_each()
 @torch.no_grad()
 def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple[lm.LmState, bool]:
     """One step of the solver, folded into the bundle, and whether the adjustment is finished.

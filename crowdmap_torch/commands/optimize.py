@@ -34,6 +34,7 @@ from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.processes.interrupts import keeping
+from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.ranges import Count, Workers, argument
 from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
@@ -95,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
         config = load_config(options.config)
         device = _device(options.device)
     # The folder first: whether it can be written, and by nobody else, is known before anything is read at length.
-    with keeping(folder.kept), folder.claimed():
+    with keeping(folder.kept), folder.claimed(), one_core_each():
         return _map(options, folder, config, device)
 
 

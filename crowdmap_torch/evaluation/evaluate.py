@@ -32,6 +32,7 @@ from crowdmap_torch.evaluation.single_journey import (
 from crowdmap_torch.evaluation.uncertainty import evaluate_uncertainty
 from crowdmap_torch.evaluation.visibility import observable_signs, oracle_figures, seen_by_journeys
 from crowdmap_torch.io.truth import SignAssociations, Truth
+from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.survey.matching import SurveyMatchConfig
 from crowdmap_torch.tables import HdMap, Lanes, Origin, Signs, Survey, to_device
 
@@ -41,6 +42,7 @@ _CONTROL_GATE_M = 1.0
 """A control sign without the survey's id is the survey's sign this near to it."""
 
 
+@one_core_each()
 def evaluate_map(
     hd_map: HdMap,
     survey: Survey,

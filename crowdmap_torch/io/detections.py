@@ -18,6 +18,7 @@ from torch import Tensor
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.geometry.camera import MAX_OFF_AXIS, Camera, inside_image, unproject
 from crowdmap_torch.io.columns import Lists, Sheet
+from crowdmap_torch.io.row_order import points_by_place, rank_of_lists, rows_by_content
 from crowdmap_torch.tables import LANE_TYPES, LaneDetections, LanePoints, SignDetections
 
 DROPPED_SIGN, DROPPED_LANE, DROPPED_LANE_POINT = "sign: ", "lane: ", "lane point: "
@@ -31,7 +32,7 @@ _MIN_EXTENT_PX = 1e-3
 
 @dataclass(frozen=True)
 class SignFile:
-    """The usable sign detections of a journey, in the order of frames."""
+    """The usable sign detections of a journey, in the order of frames and of their corners."""
 
     detections: SignDetections
     type_names: tuple[str, ...]
@@ -41,7 +42,7 @@ class SignFile:
 
 @dataclass(frozen=True)
 class LaneFile:
-    """The usable lane detections of a journey, in the order of frames, with their usable points."""
+    """The usable lane detections of a journey, in the order of frames and of their usable points."""
 
     detections: LaneDetections
     points: LanePoints
@@ -77,7 +78,10 @@ def read_sign_detections(
     corners_px = torch.from_numpy(np.stack((u.values[at], v.values[at]), axis=-1))
     ideal, faults = _corner_faults(camera, corners_px, torch.from_numpy(shape))
     usable, dropped = _count(DROPPED_SIGN, faults)
-    order = _by_frame(frame, usable.numpy())
+    corner_columns = corners_px.flatten(1).numpy().T
+    order = rows_by_content(
+        usable.numpy(), frame, (*corner_columns, shape, type_code, score, track)
+    )
     return SignFile(
         detections=SignDetections(
             row=torch.from_numpy(order),
@@ -111,7 +115,8 @@ def read_lane_detections(
     lane_type = sheet.codes("type", LANE_TYPES, optional=True)
     score = _score(sheet)
 
-    px = torch.from_numpy(np.stack((u.values, v.values), axis=-1))
+    given = np.stack((u.values, v.values), axis=-1)
+    px = torch.from_numpy(given[points_by_place(given, u.row)])
     ideal, faults = _point_faults(camera, px)
     usable, dropped = _count(DROPPED_LANE_POINT, faults)
     kept = usable.numpy()
@@ -126,8 +131,9 @@ def read_lane_detections(
             "no length": torch.from_numpy(flat),
         },
     )
-    order = _by_frame(frame, good.numpy())
-    # Points of the rows in use, those of one detection adjacent and as they stood in the file.
+    content = rank_of_lists(px.numpy()[kept], row, len(sheet))
+    order = rows_by_content(good.numpy(), frame, (content, lane_type, score))
+    # Points of the rows in use, those of one detection adjacent.
     place = np.full(len(sheet), -1)
     place[order] = np.arange(len(order))
     points = np.flatnonzero(kept & (place[u.row] >= 0))
@@ -219,14 +225,6 @@ def _count(
             dropped[prefix + reason] = count
         usable = usable & ~is_faulty
     return usable, dropped
-
-
-def _by_frame(
-    frame: Int[np.ndarray, " n"], usable: Bool[np.ndarray, " n"]
-) -> Int[np.ndarray, " d"]:
-    """The usable rows in the order of frames, those of one frame as they stood."""
-    rows = np.flatnonzero(usable)
-    return rows[np.argsort(frame[rows], kind="stable")]
 
 
 def _extent(

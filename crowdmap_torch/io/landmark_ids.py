@@ -66,7 +66,10 @@ def _name(journeys: Sequence[Journey], kind: str, found: tuple[int, int]) -> str
         return ""
     journey = journeys[number]
     detections = journey.signs if kind == "sign" else journey.lanes
-    return _digest(kind, journey.journey_id, str(int(detections.row[row])))
+    # Not its row in the file: the same rows in another order are the same journey.
+    frame = int(detections.frame[row])
+    place = int((detections.frame[:row] == frame).sum())
+    return _digest(kind, journey.journey_id, f"{int(journey.frame_number[frame])}/{place}")
 
 
 def _digest(kind: str, journey_id: str, what: str) -> str:

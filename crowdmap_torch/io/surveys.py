@@ -58,13 +58,15 @@ def _read_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
     center = center_of(corners, polygon.corner_mask(shape)).numpy()
     # Corners are the better witness: where they are known the centre is their mean.
     center[has_center & ~has_corners] = centers.values[~has_corners[has_center]]
-    return sign_id, SurveySigns(
+    signs = SurveySigns(
         shape=shape,
         corners_world=corners,
         center_world=torch.from_numpy(center),
         normal_world=read_normals(sheet, corners),
         sigma=torch.from_numpy(read_sigma(sheet)),
     )
+    order = _by_id(sign_id)
+    return tuple(sign_id[k] for k in order), signs[torch.tensor(order, dtype=torch.int64)]
 
 
 def _read_lanes(path: Path) -> tuple[tuple[str, ...], torch.Tensor, SurveyLanePoints]:
@@ -75,14 +77,24 @@ def _read_lanes(path: Path) -> tuple[tuple[str, ...], torch.Tensor, SurveyLanePo
         points.count < 2,
         lambda row: f"column 'points': {points.count[row]} points; expected 2 or more",
     )
-    lane_type = torch.from_numpy(sheet.codes("type", LANE_TYPES, optional=True))
+    lane_type = sheet.codes("type", LANE_TYPES, optional=True)
+    order = _by_id(lane_id)
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    lane = place[points.row]
+    row = np.argsort(lane, kind="stable")
     return (
-        lane_id,
-        lane_type,
+        tuple(lane_id[k] for k in order),
+        torch.from_numpy(lane_type[order]),
         SurveyLanePoints(
-            lane=torch.from_numpy(points.row), point_world=torch.from_numpy(points.values)
+            lane=torch.from_numpy(lane[row]), point_world=torch.from_numpy(points.values[row])
         ),
     )
+
+
+def _by_id(names: tuple[str, ...]) -> list[int]:
+    """Rows in the order of their ids: what is measured by a survey does not depend on the order of its rows."""
+    return sorted(range(len(names)), key=names.__getitem__)
 
 
 def _no_signs() -> SurveySigns:

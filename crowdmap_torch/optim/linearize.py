@@ -20,7 +20,7 @@ from crowdmap_torch.optim.problem import (
     Variable,
 )
 from crowdmap_torch.optim.robust import JointLoss
-from crowdmap_torch.optim.threads import in_order
+from crowdmap_torch.processes.threads import in_order
 
 CHUNK_ROWS = 1 << 14
 """Rows that are linearised at once; bounds the memory, whatever the size of the problem."""

@@ -2,12 +2,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
 
 import pytest
 import torch
+from worlds.drives import with_shuffled_rows
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io.datasets import load_dataset, row_count
+from crowdmap_torch.tables import Dataset
 
 
 def test_detections_come_in_the_order_of_frames_with_their_rows(sound) -> None:
@@ -17,6 +21,21 @@ def test_detections_come_in_the_order_of_frames_with_their_rows(sound) -> None:
     assert [polygon.SHAPES[k] for k in signs.shape] == ["triangle", "octagon", "rectangle"]
     assert signs.track.tolist() == [-1, 8, 7]
     assert signs.score.isnan().tolist() == [True, False, False]
+
+
+def test_detections_of_a_frame_come_in_one_order_however_the_rows_stood(
+    tiny_folder: Path, tiny: Dataset, tmp_path: Path
+) -> None:
+    shuffled = load_dataset(with_shuffled_rows(tiny_folder, tmp_path / "dataset", seed=1))
+    for one, other in zip(tiny.journeys, shuffled.journeys, strict=True):
+        for name in ("signs", "lanes", "lane_points"):
+            a, b = getattr(one, name), getattr(other, name)
+            columns = {f.name for f in fields(a)}
+            assert "row" not in columns or not torch.equal(a.row, b.row)
+            for column in columns - {"row"}:
+                assert torch.allclose(
+                    getattr(a, column), getattr(b, column), rtol=0, atol=0, equal_nan=True
+                ), f"{name}.{column}"
 
 
 def test_slots_past_the_corners_repeat_the_last_corner(sound) -> None:
@@ -38,7 +57,8 @@ def test_lane_points_follow_their_detections(sound) -> None:
     assert journey.lanes.row.tolist() == [1, 0]
     assert journey.lanes.type.tolist() == [-1, 0]
     assert journey.lane_points.detection.tolist() == [0, 0, 1, 1, 1]
-    assert journey.lane_points.px[2:, 0].tolist() == [60.0, 40.0, 20.0]
+    # From the bottom of the image up.
+    assert journey.lane_points.px[2:].tolist() == [[20.0, 79.0], [40.0, 60.0], [60.0, 50.0]]
 
 
 def quad(u: list[float], v: list[float]) -> Callable:
@@ -119,7 +139,7 @@ def test_lane_points_outside_the_image_are_left_out(sound) -> None:
     sound.journeys["b"].lanes["u"][0][1] = 200.0
     journey = load_dataset(sound.write()).journeys[1]
     assert journey.dropped == {"lane point: outside the image": 1}
-    assert journey.lane_points.px[:, 0].tolist() == [70.0, 90.0, 60.0, 20.0]
+    assert journey.lane_points.px[:, 0].tolist() == [90.0, 70.0, 20.0, 60.0]
     assert row_count(journey, "lane") == 2
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
@@ -132,6 +135,19 @@ def shuffled(journey: Journey, generator: torch.Generator) -> Journey:
         torch.randperm(len(journey.signs), generator=generator),
         torch.randperm(len(journey.lanes), generator=generator),
     )
+
+
+def with_shuffled_rows(dataset: Path, out: Path, *, seed: int) -> Path:
+    """A copy of a dataset's files with the rows of detections and of the survey in a random order."""
+    shutil.copytree(dataset, out)
+    random = np.random.default_rng(seed)
+    files = [*out.glob("journeys/*/*.parquet"), *out.glob("survey/*.parquet")]
+    for path in sorted(files):
+        # Poses are sorted by frame, as FORMAT.md asks for.
+        if path.name != "poses.parquet":
+            table = pq.read_table(path)
+            pq.write_table(table.take(random.permutation(len(table))), path)
+    return out
 
 
 def with_poses(journey: Journey, T_world_camera: Tensor) -> Journey:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, RowGradients, chunks, rows
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
-from crowdmap_torch.optim.threads import in_order
+from crowdmap_torch.processes.threads import in_order
 
 _Blocks = TypeVar("_Blocks", bound=RowGradients)
 _Blocks_co = TypeVar("_Blocks_co", bound=RowGradients, covariant=True)

@@ -41,7 +41,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
 from crowdmap_torch.optim.solvers.windows import Batch
-from crowdmap_torch.optim.threads import in_order
+from crowdmap_torch.processes.threads import in_order
 
 UNOBSERVED_FLOOR = 1e-9
 """Information added to every landmark before its covariance is read: none that nothing observes spoils the others."""

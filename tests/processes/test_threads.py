@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info
 
-from crowdmap_torch.optim.threads import in_order
+from crowdmap_torch.processes.threads import in_order, one_core_each
 
 CPU = torch.device("cpu")
 
@@ -47,3 +49,28 @@ def test_whether_gradients_are_recorded_is_known_to_every_thread(threads: int):
         without = list(in_order(lambda i: (weight * i).requires_grad, list(range(50)), CPU))
     assert not any(without)
     assert all(in_order(lambda i: (weight * i).requires_grad, list(range(50)), CPU))
+
+
+def test_every_operation_runs_on_one_core_and_then_as_before(threads: int):
+    with one_core_each():
+        assert torch.get_num_threads() == 1
+        with one_core_each():
+            assert torch.get_num_threads() == 1
+        assert {pool["num_threads"] for pool in threadpool_info()} == {1}
+        together = list(in_order(lambda i: threading.get_ident(), list(range(50)), CPU))
+        assert (threading.get_ident() in together) == (threads == 1)
+    assert torch.get_num_threads() == threads
+
+
+def test_threads_are_as_before_after_an_error(threads: int):
+    with pytest.raises(ValueError, match="on the way"), one_core_each():
+        raise ValueError("on the way")
+    assert torch.get_num_threads() == threads
+
+
+def test_pieces_within_pieces_are_not_waited_for_in_vain(threads: int):
+    def inner(i: int) -> int:
+        return sum(in_order(lambda k: k, list(range(i, i + 20)), CPU))
+
+    items = list(range(40))
+    assert list(in_order(inner, items, CPU)) == [sum(range(i, i + 20)) for i in items]

@@ -1,0 +1,98 @@
+"""Pieces of one computation on several cores: a thread for each, every operation within it on one core.
+
+Operations on small blocks hardly gain from several cores each, and adding into shared sums not at all. A sum that torch
+or a BLAS takes on several cores is another one in its last bits than on one. So pieces are computed side by side, every
+operation on one core, and whoever asked for the pieces adds them up, in order: results do not depend on the number of cores.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import TypeVar
+
+import torch
+from threadpoolctl import ThreadpoolController
+
+_WORTH = 4
+"""Items for each thread from which handing them over pays."""
+_AHEAD = 3
+"""Results for each thread that may be held: whoever takes them has other things to do too."""
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class _Kept(threading.local):
+    cores: int | None = None
+    """How many cores this thread's operations had before `one_core_each`; None outside."""
+
+
+_kept = _Kept()
+
+
+@contextmanager
+def one_core_each() -> Iterator[None]:
+    """Within it, or a function that it decorates, every operation of torch, NumPy and SciPy runs on one core.
+
+    Sums then have the same bits on any machine of one kind, whatever number of threads it may use; `in_order` still takes
+    as many as torch may use outside.
+    """
+    if _kept.cores is not None:
+        yield
+        return
+    _kept.cores = cores = torch.get_num_threads()
+    try:
+        with _libraries().limit(limits=1):
+            torch.set_num_threads(1)
+            yield
+    finally:
+        _kept.cores = None
+        # After the libraries' own limits: torch's OpenMP is one of them.
+        torch.set_num_threads(cores)
+
+
+def in_order(function: Callable[[T], R], items: Sequence[T], device: torch.device) -> Iterator[R]:
+    """`function` of every item, in order; on as many cores as torch may use where the device is a CPU.
+
+    Only a few results are held at a time, so that memory does not grow with their number.
+    """
+    threads = _kept.cores or torch.get_num_threads()
+    if device.type != "cpu" or threads == 1 or len(items) < _WORTH * threads:
+        with one_core_each():
+            yield from map(function, items)
+        return
+    with one_core_each():
+        pool = _pool(threads)
+        gradients = torch.is_grad_enabled()
+
+        def run(item: T) -> R:
+            # Whether gradients are recorded is known to each thread by itself.
+            with torch.set_grad_enabled(gradients):
+                return function(item)
+
+        waiting: deque[Future[R]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(run, item))
+                if len(waiting) > _AHEAD * threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+@lru_cache(maxsize=1)
+def _libraries() -> ThreadpoolController:
+    """The thread pools of the libraries that are loaded: found once, which takes milliseconds."""
+    return ThreadpoolController()
+
+
+@lru_cache(maxsize=1)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "in_order", initializer=torch.set_num_threads, initargs=(1,))
