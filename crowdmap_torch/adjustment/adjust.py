@@ -20,6 +20,7 @@ from crowdmap_torch.adjustment.bundle import Bundle, Observations, Priors, Unkno
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes
+from crowdmap_torch.adjustment.lenses import lenses_of
 from crowdmap_torch.adjustment.observations import (
     CornerObservations,
     corner_observations,
@@ -35,12 +36,7 @@ from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend
 from crowdmap_torch.processes.threads import one_core_each
-from crowdmap_torch.residuals.lane import (
-    lane_prior,
-    lane_prior_jacobian,
-    lane_stretch,
-    lane_stretch_jacobian,
-)
+from crowdmap_torch.residuals.lane import lane_prior, lane_stretch
 from crowdmap_torch.residuals.sign_prior import against_the_drive, habit_term, sign_place
 from crowdmap_torch.survey.control import ControlSigns
 from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Signs
@@ -197,6 +193,7 @@ def go_on(bundle: Bundle, standing: Standing) -> lm.LmState:
                 )
     bundle.load_state_dict({**own, **standing.bundle})
     bundle.fold(dict(standing.state.values))
+    bundle.relinearise()
     return standing.state
 
 
@@ -251,7 +248,7 @@ def _observations(
     lane, t = nearest_lanes(ground, lanes, gate=config.lane_gate_m)
     found = lane >= 0
     matches = LaneMatches(lane[found], t[found], points.ideal[found], found[found])
-    return Observations(corners, points[found], matches)
+    return Observations(corners, points[found], matches, lenses_of(journeys)[0])
 
 
 def _fixed_terms(
@@ -284,6 +281,7 @@ def _control_term(control: ControlSigns, signs: Signs) -> CostTerm:
         (("sign", control.sign), ("size", control.sign)),
         (template, control.center_world),
         1 / control.sigma,
+        takes_rows=True,
     )
 
 
@@ -310,7 +308,7 @@ def _lane_prior(
         (("lane", torch.arange(len(coefficient), device=coefficient.device)),),
         (coefficient.clone(), axes),
         coefficient.new_full((len(coefficient),), 1 / config.lane_place_sigma_m),
-        jacobian=lane_prior_jacobian,
+        takes_rows=True,
     )
     first = torch.nonzero(spline[1:] == spline[:-1])[:, 0]
     step = CostTerm(
@@ -318,7 +316,7 @@ def _lane_prior(
         (("lane", first), ("lane", first + 1)),
         (coefficient[first + 1] - coefficient[first], axes[first]),
         (1 / coefficient.new_tensor(config.lane_step_sigma_m)).expand(len(first), 3).contiguous(),
-        jacobian=lane_stretch_jacobian,
+        takes_rows=True,
     )
     return {"lane_prior": place, "lane_stretch": step}
 

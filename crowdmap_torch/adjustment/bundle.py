@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -11,13 +12,23 @@ from torch import Tensor, nn
 
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
+from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.geometry import se3, spline_basis
+from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.noise.pixels import noise_by_box, shared_error
 from crowdmap_torch.noise.pose_prior import PosePrior
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
-from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
+from crowdmap_torch.optim.problem import (
+    CostTerm,
+    Problem,
+    Variable,
+    euclidean,
+    positive,
+    pull_euclidean,
+    pull_positive,
+)
 from crowdmap_torch.optim.robust import JointTukey, Tukey, median_scale
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
 from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBackend
@@ -39,12 +50,12 @@ _SCALE_RESTS = 0.005
 
 
 VARIABLES = {
-    "pose": Variable(6, se3.retract),
-    "drift": Variable(6, euclidean),
-    "bias": Variable(6, euclidean),
-    "sign": Variable(6, se3.retract),
-    "size": Variable(2, positive),
-    "lane": Variable(3, euclidean),
+    "pose": Variable(6, se3.retract, pull=se3.pull),
+    "drift": Variable(6, euclidean, pull=pull_euclidean),
+    "bias": Variable(6, euclidean, pull=pull_euclidean),
+    "sign": Variable(6, se3.retract, pull=se3.pull),
+    "size": Variable(2, positive, pull=pull_positive),
+    "lane": Variable(3, euclidean, pull=pull_euclidean),
 }
 """The unknowns: camera poses, their slow errors and each journey's constant one; signs, their sides, lanes' coefficients."""
 
@@ -69,6 +80,8 @@ class Observations:
     lane_points: LanePointObservations
     matches: LaneMatches
     """Where each lane point starts."""
+    lenses: tuple[Camera, ...]
+    """The cameras that they were seen by."""
 
     def renumbered(self, row_of_frame: Int[Tensor, " f"]) -> Observations:
         """Those of the frames that have a row, by rows; -1: the frame has none."""
@@ -78,6 +91,7 @@ class Observations:
             replace(self.corners[of_corner], frame=corner[of_corner]),
             replace(self.lane_points[of_point], frame=point[of_point]),
             self.matches[of_point],
+            self.lenses,
         )
 
 
@@ -137,6 +151,9 @@ class Bundle(nn.Module):
         self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points
+        self.lenses = observations.lenses
+        self._corners_by_lens = rows_by_lens(self.corners, self.lenses)
+        self._lane_points_by_lens = rows_by_lens(self.lane_points, self.lenses)
         self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
         self.config = config
         # Where each lane point was followed to is part of the state: matching starts from there.
@@ -162,6 +179,12 @@ class Bundle(nn.Module):
         super()._apply(fn, recurse)
         self.__dict__.update(to_device(vars(self), self.scale.device))
         return self
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
+        """Goes on where another bundle stood; the lenses follow the unknowns, so they are not in the dictionary."""
+        found = super().load_state_dict(state_dict, *args, **options)
+        self.relinearise()
+        return found
 
     def values(self) -> dict[str, Tensor]:
         """Base values moved by the increments."""
@@ -202,6 +225,7 @@ class Bundle(nn.Module):
             found = follow(self.matches, self.lane_points, pose, values["lane"], self.lane_count)
             self.match_t, self.match_normal = found.t, found.normal_px
             self.match_valid = found.valid
+        self.relinearise()
         at_rest = self._narrow(values)
         rescaled = self.prior.rescaled(values["drift"], self.prior_scale)
         moved = (rescaled / self.prior_scale).log().abs() > _SCALE_RESTS
@@ -209,6 +233,23 @@ class Bundle(nn.Module):
         self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))
         self.refreshed.fill_(True)
         return at_rest and not bool(moved.any())
+
+    @torch.no_grad()
+    def relinearise(self) -> None:
+        """Takes every lens as it is where the unknowns, and the splines' matches, have the points by now."""
+        values, rows = self.values(), self.corners
+        if len(rows):
+            sign = values["sign"][rows.sign]
+            corner = torch.nn.functional.pad(rows.template * values["size"][rows.sign], (0, 1))
+            point = se3.transform(sign, corner)
+            seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
+            self.corners = relinearised(rows, self.lenses, self._corners_by_lens, seen)
+        rows = self.lane_points
+        if len(rows):
+            coefficient, weight = self._windows()
+            point = (weight[..., None] * values["lane"][coefficient]).sum(1)
+            seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
+            self.lane_points = relinearised(rows, self.lenses, self._lane_points_by_lens, seen)
 
     @torch.no_grad()
     def judge(self, backend: MapBackend) -> bool:
@@ -263,19 +304,26 @@ class Bundle(nn.Module):
 
         Of a bundle that was never refreshed they are found first.
         """
-        return Problem(self.variables, {**self._terms(self.prior_scale), **self._slide_term()})
+        return self._problem({**self._terms(self.prior_scale), **self._slide_term()})
 
     def information(self, prior_scale: Float[Tensor, "j 3"]) -> Problem:
         """The problem whose Hessian tells what is known: nothing held, `prior_scale` for that of the bundle.
 
         The weights of detections are raised to what they keep of the information.
         """
-        terms = {
-            name: replace(term, loss=term.loss.informative())
-            if isinstance(term.loss, JointTukey)
-            else term
-            for name, term in self._terms(prior_scale).items()
-        }
+        return self._problem(
+            {
+                name: replace(term, loss=term.loss.informative())
+                if isinstance(term.loss, JointTukey)
+                else term
+                for name, term in self._terms(prior_scale).items()
+            }
+        )
+
+    def _problem(self, terms: dict[str, CostTerm]) -> Problem:
+        """The problem of these terms, with the Jacobians that the configuration asks for."""
+        if self.config.jacobians == "autograd":
+            terms = {name: term.by_autograd() for name, term in terms.items()}
         return Problem(self.variables, terms)
 
     def _terms(self, prior_scale: Float[Tensor, "j 3"]) -> dict[str, CostTerm]:
@@ -322,6 +370,7 @@ class Bundle(nn.Module):
             (classes[away.argmin(1)],),
             size.new_full((len(size),), 1 / self.config.size_class_sigma),
             Tukey(self.config.tukey_c),
+            takes_rows=True,
         )
         return {"size_class": term}
 
@@ -341,7 +390,7 @@ class Bundle(nn.Module):
             (("pose", self.beside), ("lane", index)),
             (offset, along),
             offset.new_full((len(offset),), 1 / self.config.lane_slide_m),
-            jacobian=lane.lane_slide_jacobian,
+            takes_rows=True,
         )
         return {"lane_slide": term}
 
@@ -349,10 +398,7 @@ class Bundle(nn.Module):
         rows = self.lane_points
         if not len(rows):
             return {}
-        count, of = self.lane_count, self.matches.lane
-        coefficient, weight, _ = spline_basis.window_flat(
-            self.matches.t.clamp_min(0), spline_basis.starts(count)[of], count[of]
-        )
+        coefficient, weight = self._windows()
         lane_slots = (("lane", column.contiguous()) for column in coefficient.unbind(1))
         slots, valid = (("pose", rows.frame), *lane_slots), self.matches.valid.to(weight)
         image = CostTerm(
@@ -372,3 +418,11 @@ class Bundle(nn.Module):
             lane.lane_height_jacobian,
         )
         return {"lane_reprojection": image, "lane_height": height}
+
+    def _windows(self) -> tuple[Int[Tensor, "m 4"], Float[Tensor, "m 4"]]:
+        """The four coefficients of the spline point that each lane point is held against, and their weights."""
+        count, of = self.lane_count, self.matches.lane
+        coefficient, weight, _ = spline_basis.window_flat(
+            self.matches.t.clamp_min(0), spline_basis.starts(count)[of], count[of]
+        )
+        return coefficient, weight

@@ -23,6 +23,8 @@ from crowdmap_torch.ranges import (
 )
 from crowdmap_torch.residuals.sign_prior import SignHabit
 
+JACOBIANS = ("closed", "autograd")
+
 
 @dataclass(frozen=True)
 class AdjustConfig(Settings):
@@ -34,6 +36,9 @@ class AdjustConfig(Settings):
         )
     )
     """The solver; its tolerance counts once the scales stand still."""
+    jacobians: str = "closed"
+    """`autograd`: of every residual by autograd and the chain rule; `closed`: in closed form where there is one, which is
+    faster and the same."""
     prior: PosePriorConfig = field(default_factory=PosePriorConfig)
     """What the poses may be wrong by."""
     tukey_c: Deviations = 4.685
@@ -83,3 +88,11 @@ class AdjustConfig(Settings):
     gradients, matrix-free, and their covariances estimated from samples."""
     covariance_samples: Count = 64
     """Samples of the map that such covariances are estimated from; their sigmas are then good to 9 %."""
+
+    def __post_init__(self) -> None:
+        """Refuses unknown jacobians."""
+        super().__post_init__()
+        if self.jacobians not in JACOBIANS:
+            raise ValueError(
+                f"jacobians: expected one of {', '.join(JACOBIANS)}, found {self.jacobians!r}"
+            )

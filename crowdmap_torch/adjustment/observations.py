@@ -10,28 +10,25 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from crowdmap_torch.adjustment.lenses import SeenPoints, lenses_of, seen_points
 from crowdmap_torch.geometry import camera, polygon
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.road.ground_projection import ground_points_camera
-from crowdmap_torch.tables import Association, Journey, RoadEstimate, Rows, Signs, concatenate
+from crowdmap_torch.tables import Association, Journey, RoadEstimate, Signs, concatenate
 
 _CURVATURE = 1e-3
 """Vertical curvature of roads [1/m] that the plane under the car leaves out: a crest of 1 km radius."""
 
 
 @dataclass(frozen=True)
-class CornerObservations(Rows):
+class CornerObservations(SeenPoints):
     """Sign corners seen in frames; those of a detection are adjacent."""
 
-    frame: Int[Tensor, " m"]
-    """Frame, counted over all journeys."""
     detection: Int[Tensor, " m"]
     """Sign detection, counted over all journeys, twice: the centre of a box is one of its own."""
     sign: Int[Tensor, " m"]
     template: Float[Tensor, "m 2"]
     """The corner for width and height one, on the sign's plane."""
-    matrix: Float[Tensor, "m 3 3"]
-    """Observation matrix (geometry.camera)."""
     box_px: Float[Tensor, " m"]
     """Larger side of the detection's box in the image."""
     loose_px: Float[Tensor, " m"]
@@ -39,15 +36,12 @@ class CornerObservations(Rows):
 
 
 @dataclass(frozen=True)
-class LanePointObservations(Rows):
+class LanePointObservations(SeenPoints):
     """Lane points seen in frames."""
 
-    frame: Int[Tensor, " m"]
     journey: Int[Tensor, " m"]
     detection: Int[Tensor, " m"]
     """Lane detection of the journey."""
-    ideal: Float[Tensor, "m 2"]
-    matrix: Float[Tensor, "m 3 3"]
     normal_camera: Float[Tensor, "m 3"]
     """The road's normal in that frame."""
     camera_height: Float[Tensor, " m"]
@@ -75,13 +69,13 @@ def corner_observations(
     Detections that are axis-aligned boxes were drawn around a sign, with sides wrong by the share `box_sigma`: their
     centres are rows of their own, and their corners know no more than that.
     """
-    offsets = frame_offsets(journeys)
+    offsets, (_, lenses) = frame_offsets(journeys), lenses_of(journeys)
     begins = accumulate((len(journey.signs) for journey in journeys), initial=0)
     return concatenate(
         [
-            _corners(journey, association, signs, offset, detections, box_sigma)
-            for journey, association, offset, detections in zip(
-                journeys, associations, offsets, begins, strict=False
+            _corners(journey, lens, association, signs, offset, detections, box_sigma)
+            for journey, lens, association, offset, detections in zip(
+                journeys, lenses, associations, offsets, begins, strict=False
             )
         ]
     )
@@ -89,6 +83,7 @@ def corner_observations(
 
 def _corners(
     journey: Journey,
+    lens: int,
     association: Association,
     signs: Signs,
     offset: int,
@@ -119,17 +114,19 @@ def _corners(
         return (at_corners[centre] * among).sum(1) / among.sum(1)
 
     of = torch.cat((row, centre))
-    px, ideal, template = (
-        torch.cat((part[row, corner], mean(part))) for part in (px, ideal, template)
-    )
+    # What the centre of a box shows is the middle of undistorted corners, in the pixel where the lens has it.
+    middle = mean(ideal)
+    px = torch.cat((px[row, corner], camera.distort(journey.rig.camera, middle)))
+    ideal = torch.cat((ideal[row, corner], middle))
+    template = torch.cat((template[row, corner], mean(template)))
     loose = torch.zeros_like(box[of])
     loose[: len(row)] = box_sigma / 2 * box[row] * boxed[row]
     return CornerObservations(
+        **seen_points(journey.rig.camera, lens, px, ideal),
         frame=detections.frame[used][of] + offset,
         detection=2 * (used[of] + before) + (torch.arange(len(of), device=of.device) >= len(row)),
         sign=sign[of],
         template=template,
-        matrix=camera.observation_matrix(journey.rig.camera, px, ideal),
         box_px=box[of],
         loose_px=loose,
     )
@@ -148,7 +145,7 @@ def lane_point_observations(
     The height that the road gives a point is trusted to `height_sigma` [m] under the car, and less further ahead, where
     the normal's own error and the road's curvature tell.
     """
-    offsets = frame_offsets(journeys)
+    offsets, (_, lenses) = frame_offsets(journeys), lenses_of(journeys)
     tables = []
     for number, (journey, road, offset) in enumerate(zip(journeys, roads, offsets, strict=False)):
         cell = (station(journey.T_world_camera) / keyframe_spacing).floor()
@@ -173,11 +170,10 @@ def lane_point_observations(
         slope = road.sigma[frame] + distance * _CURVATURE
         tables.append(
             LanePointObservations(
+                **seen_points(journey.rig.camera, lenses[number], points.px, points.ideal),
                 frame=frame + offset,
                 journey=torch.full_like(points.detection, number),
                 detection=points.detection,
-                ideal=points.ideal,
-                matrix=camera.observation_matrix(journey.rig.camera, points.px, points.ideal),
                 normal_camera=normal,
                 camera_height=height,
                 height_sigma=(height_sigma**2 + (slope * distance).square()).sqrt(),

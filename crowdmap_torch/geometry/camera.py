@@ -61,6 +61,11 @@ class Camera:
                 f"coefficients; expected one of {counts}"
             )
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the camera is a pinhole's, without any distortion."""
+        return self.model == "brown_conrady" and self.distortion.numel() == 0
+
     @cached_property
     def monotonic_radius(self) -> float:
         """Radius on the plane z = 1 up to which the lens is one-to-one; `MAX_OFF_AXIS` at most."""
@@ -131,21 +136,23 @@ def pixel_jacobian(camera: Camera, ideal: Float[Tensor, "*batch 2"]) -> Float[Te
 
 
 def observation_matrix(
-    camera: Camera, px: Float[Tensor, "*batch 2"], ideal: Float[Tensor, "*batch 2"]
+    camera: Camera,
+    px: Float[Tensor, "*batch 2"],
+    ideal: Float[Tensor, "*batch 2"],
+    *,
+    bend: Float[Tensor, "*batch 2"] | None = None,
 ) -> Float[Tensor, "*batch 3 3"]:
     """The matrix M that turns a camera-frame point p into its pixel error, `(M p)[:2] / (M p)[2]`.
 
-    The error is that of the raw pixel, projected minus observed; `ideal` is the undistorted `px`.
-    Without distortion it is exact. With distortion the lens is replaced by the projective map that
-    agrees with it around the detection: with `d = p_xy / p_z - ideal` the error is `W d / (1 + g .
-    d)`, W being the lens' derivative. Of all g, `-grad(log det W) / 3` fits the second derivatives
-    best (it is exact for a lens that is a projective map): 0.01 px at 3 px from the detection where
-    W alone, g = 0, leaves 0.05, and 0.3 for fisheyes. `(M p)[2]` is a depth along the ray seen.
+    The error is that of the raw pixel, projected minus observed, at a point seen at `ideal` exactly so, derivative
+    included: at the undistorted `px`, or wherever a solver has its point by now. Without distortion it is exact
+    everywhere. With distortion the lens is replaced by the projective map that agrees with it there: with `d = p_xy / p_z -
+    ideal` the error is `distort(ideal) - px + W d / (1 + g . d)`, W being the lens' derivative and g its `bend`, found
+    here unless it is given.
     """
     observed, W = _distort_with_jacobian(camera, ideal)
-    g = _projective_term(camera, ideal)
-    # Nothing but rounding where the pixel closes; what does not close keeps its difference in the
-    # error.
+    g = projective_bend(camera, ideal) if bend is None else bend
+    # At the undistorted pixel nothing but rounding where that closes.
     offset = observed - px
     g_ideal = 1 - (g * ideal).sum(-1, keepdim=True)
     left = W + offset[..., :, None] * g[..., None, :]
@@ -155,9 +162,13 @@ def observation_matrix(
     return torch.cat((top, bottom), dim=-2)
 
 
-def _projective_term(camera: Camera, ideal: Tensor) -> Tensor:
-    """The g of `observation_matrix`; zero where its pole would be near, as next to a fold."""
-    if camera.distortion.numel() == 0 and camera.model == "brown_conrady":
+def projective_bend(camera: Camera, ideal: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+    """The g of `observation_matrix`; zero where its pole would be near, as next to a fold.
+
+    Of all g, `-grad(log det W) / 3` fits the second derivatives best (it is exact for a lens that is a projective map): at
+    3 px from `ideal` 0.01 px are left where W alone, g = 0, leaves 0.05, and 0.3 for fisheyes.
+    """
+    if camera.is_linear:
         return torch.zeros_like(ideal)
 
     def log_det(x: Tensor) -> Tensor:

@@ -115,6 +115,23 @@ def retract(
     return make(T[..., :3, :3] @ so3_exp(xi[..., 3:]), T[..., :3, 3] + xi[..., :3])
 
 
+def pull(
+    T: Float[Tensor, "4 4 *#rows"], gradient: Float[Tensor, "d 4 4 *#rows"]
+) -> Float[Tensor, "d 6 *#rows"]:
+    """Derivatives by the tangent of `retract` at zero, of those by the entries of `T`; the rows come last.
+
+    A turn by w adds `R skew(w)` to R, so its derivative is the axis of `R^T G - (R^T G)^T`, G being those by R.
+    """
+    R, by_R = T[:3, :3], gradient[:, :3, :3]
+
+    def entry(i: int, j: int) -> Tensor:
+        total = torch.addcmul(R[0, i] * by_R[:, 0, j], R[1, i], by_R[:, 1, j])
+        return torch.addcmul(total, R[2, i], by_R[:, 2, j])
+
+    turn = (entry(2, 1) - entry(1, 2), entry(0, 2) - entry(2, 0), entry(1, 0) - entry(0, 1))
+    return torch.cat((gradient[:, :3, 3], torch.stack(turn, dim=1)), dim=1)
+
+
 def local(
     T_from: Float[Tensor, "*batch 4 4"], T_to: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 6"]:

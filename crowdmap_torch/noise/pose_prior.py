@@ -110,13 +110,13 @@ class PosePrior:
                 self.slots["pose_bias"],
                 (torch.zeros_like(bias),),
                 1 / bias,
-                jacobian=residuals.gauss_markov_start_jacobian,
+                takes_rows=True,
             ),
             "pose_absolute": CostTerm(
                 residuals.gauss_markov_start,
                 self.slots["pose_absolute"],
                 weight=1 / drift[journey[self.begins]],
-                jacobian=residuals.gauss_markov_start_jacobian,
+                takes_rows=True,
             ),
             "pose_relative": CostTerm(
                 residuals.gauss_markov_step,

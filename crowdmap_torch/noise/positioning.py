@@ -22,7 +22,6 @@ from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.ranges import FILLED, Factor, Length, Settings, Sigma, SigmaOrNone, Spacing
 from crowdmap_torch.residuals.pose import (
     gauss_markov_start,
-    gauss_markov_start_jacobian,
     gauss_markov_step,
     gauss_markov_step_jacobian,
 )
@@ -168,6 +167,6 @@ def drift_terms(
             (("drift", before[:1]),),
             (at_rest[None],),
             (1 / far)[None],
-            jacobian=gauss_markov_start_jacobian,
+            takes_rows=True,
         ),
     }

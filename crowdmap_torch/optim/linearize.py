@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.func import jacfwd, vmap
+from torch.func import vjp, vmap
 
 from crowdmap_torch.optim.problem import (
     CostTerm,
@@ -53,10 +53,7 @@ def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:
     """Whitened residuals of all rows."""
     if not len(term):
         return torch.zeros(0, 1, dtype=next(iter(values.values())).dtype)
-    evaluate = term.residual
-    if term.jacobian is None:
-        evaluate = vmap(evaluate, in_dims=-1, out_dims=-1)
-    residual = evaluate(*_arguments(term, values))
+    residual = _evaluate(term, _arguments(term, values))
     return (residual if term.weight is None else residual * _scale(term.weight)).mT.contiguous()
 
 
@@ -212,22 +209,55 @@ def _jacobians(
 def autograd_jacobians(
     term: CostTerm, variables: Mapping[str, Variable], values: Values
 ) -> tuple[Float[Tensor, "d m"], tuple[Float[Tensor, "d _ m"], ...]]:
-    """Residuals and Jacobians (not whitened) by forward-mode autograd through every retraction."""
+    """Residuals and Jacobians (not whitened) by reverse-mode autograd, and the chain rule through every retraction.
+
+    One pass back for each number of the residual: rows do not depend on each other, so it gives that number's derivatives
+    for all rows at once.
+    """
     kinds = [variables[name] for name, _ in term.slots]
-
-    def moved(tangents, arguments):
-        at = [
-            kind.retract(block[None], xi[None])[0]
-            for kind, block, xi in zip(kinds, arguments, tangents, strict=False)
-        ]
-        residual = term.residual(*at, *arguments[len(at) :])
-        return residual, residual
-
     arguments = _arguments(term, values)
-    zero = tuple(arguments[0].new_zeros(kind.tangent_dim, len(term)) for kind in kinds)
-    by_tangents = vmap(jacfwd(moved, has_aux=True), in_dims=-1, out_dims=-1)
-    jacobians, residual = by_tangents(zero, arguments)
-    return residual, jacobians
+    blocks = [block.detach().requires_grad_() for block in arguments[: len(kinds)]]
+    with torch.enable_grad():
+        residual = _evaluate(term, (*blocks, *arguments[len(kinds) :]))
+        numbers = residual.unbind(0) if residual.requires_grad else ()
+    by_number = [_by_blocks(number, blocks) for number in numbers]
+    jacobians = [
+        _pulled_back(kind, block.detach(), torch.stack(by_block))
+        for kind, block, by_block in zip(kinds, blocks, zip(*by_number, strict=True), strict=True)
+    ] or [residual.new_zeros(len(residual), kind.tangent_dim, len(term)) for kind in kinds]
+    return residual.detach(), tuple(jacobians)
+
+
+def _by_blocks(number: Float[Tensor, " m"], blocks: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """The derivatives of one number of every row by its blocks."""
+    found = torch.autograd.grad(
+        number, blocks, torch.ones_like(number), retain_graph=True, allow_unused=True
+    )
+    return tuple(
+        torch.zeros_like(block) if x is None else x for x, block in zip(found, blocks, strict=True)
+    )
+
+
+def _pulled_back(
+    kind: Variable, block: Float[Tensor, "*block m"], gradient: Float[Tensor, "d *block m"]
+) -> Float[Tensor, "d k m"]:
+    """Derivatives by a variable's tangents at zero, of those by its value."""
+    if kind.pull is not None:
+        return kind.pull(block, gradient)
+    value = block.movedim(-1, 0)
+
+    def moved(tangent: Tensor) -> Tensor:
+        return kind.retract(value, tangent)
+
+    _, pull, *_ = vjp(moved, value.new_zeros(len(value), kind.tangent_dim))
+    return torch.stack([pull(row.movedim(-1, 0))[0].mT for row in gradient])
+
+
+def _evaluate(term: CostTerm, arguments: tuple[Tensor, ...]) -> Float[Tensor, "d m"]:
+    """The residual of all rows."""
+    if term.takes_rows or term.jacobian is not None:
+        return term.residual(*arguments)
+    return vmap(term.residual, in_dims=-1, out_dims=-1)(*arguments)
 
 
 def _arguments(term: CostTerm, values: Values) -> tuple[Tensor, ...]:

@@ -8,7 +8,7 @@ camera is.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -29,6 +29,9 @@ class Variable:
     """`(values [n, ...], tangents [n, tangent_dim]) -> values`; must be the identity at zero."""
     group: Int[Tensor, " n"] | None = None
     """Which of several independent problems each block belongs to; None: there is one problem."""
+    pull: Callable[[Tensor, Tensor], Tensor] | None = None
+    """The chain rule through `retract` at zero tangent: `(values [..., m], gradients by the values [d, ..., m]) -> gradients
+    by the tangents [d, tangent_dim, m]`, the rows last. None: by autograd of `retract`, which is slower."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,8 @@ class CostTerm:
     residual: Callable[..., Tensor]
     """Residual of ONE row: the value of one block per slot, then one row of each constant, to a vector [d].
 
-    With a `jacobian` beside it, it is handed many rows at once as well, the rows their last axis; without, `vmap` maps it.
+    With a `jacobian` beside it, or if it `takes_rows`, it is handed many rows at once as well, the rows their last axis;
+    else `vmap` maps it.
     """
     slots: tuple[tuple[str, Int[Tensor, " m"]], ...]
     """Per slot the variable's name and the block that each row touches."""
@@ -87,6 +91,13 @@ class CostTerm:
     The arguments are those of `residual`, the rows their last axis. There is one Jacobian per slot, in their order; any
     further ones, of arguments that this term holds constant, are not looked at.
     """
+    takes_rows: bool = False
+    """Whether `residual` serves many rows at once, their number its last axis."""
+
+    def by_autograd(self) -> CostTerm:
+        """The same term without its closed form."""
+        rows = self.takes_rows or self.jacobian is not None
+        return replace(self, jacobian=None, takes_rows=rows)
 
     def __len__(self) -> int:
         return len(self.slots[0][1])
@@ -120,6 +131,20 @@ def euclidean(value: Float[Tensor, "n k"], delta: Float[Tensor, "n k"]) -> Float
     return value + delta
 
 
+def pull_euclidean(
+    value: Float[Tensor, "k m"], gradient: Float[Tensor, "d k m"]
+) -> Float[Tensor, "d k m"]:
+    """Chain rule through `euclidean`."""
+    return gradient
+
+
 def positive(value: Float[Tensor, "n k"], delta: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     """Retraction of positive numbers: tangents are relative changes, and no step leaves the set."""
     return value * torch.exp(delta)
+
+
+def pull_positive(
+    value: Float[Tensor, "k m"], gradient: Float[Tensor, "d k m"]
+) -> Float[Tensor, "d k m"]:
+    """Chain rule through `positive` at zero."""
+    return gradient * value

@@ -129,38 +129,6 @@ def lane_height_jacobian(
     return height, _by_pose_and_spline(T_world_camera, point, by_camera, weights)
 
 
-def lane_prior_jacobian(
-    coefficient: Float[Tensor, "3 m"],
-    start: Float[Tensor, "3 m"],
-    R_world_lane: Float[Tensor, "3 3 m"],
-) -> tuple[Float[Tensor, "3 m"], tuple[Tensor]]:
-    """`lane_prior` and its Jacobian by the coefficient."""
-    return lane_prior(coefficient, start, R_world_lane), (R_world_lane.transpose(0, 1),)
-
-
-def lane_stretch_jacobian(
-    c0: Float[Tensor, "3 m"],
-    c1: Float[Tensor, "3 m"],
-    start: Float[Tensor, "3 m"],
-    R_world_lane: Float[Tensor, "3 3 m"],
-) -> tuple[Float[Tensor, "3 m"], tuple[Tensor, Tensor]]:
-    """`lane_stretch` and its Jacobians by the two coefficients."""
-    by_c1 = R_world_lane.transpose(0, 1)
-    return lane_stretch(c0, c1, start, R_world_lane), (-by_c1, by_c1)
-
-
-def lane_slide_jacobian(
-    T_world_camera: Float[Tensor, "4 4 m"],
-    coefficient: Float[Tensor, "3 m"],
-    offset: Float[Tensor, "3 m"],
-    along: Float[Tensor, "3 m"],
-) -> tuple[Float[Tensor, "1 m"], tuple[Tensor, Tensor]]:
-    """`lane_slide` and its Jacobians by camera pose and coefficient."""
-    slid = lane_slide(T_world_camera, coefficient, offset, along)
-    by_pose = torch.nn.functional.pad(-along, (0, 0, 0, 3))
-    return slid, (by_pose[None], along[None])
-
-
 def _spline_point(
     coefficients: tuple[Tensor, ...], weights: Float[Tensor, "4 *#rows"]
 ) -> Float[Tensor, "3 *#rows"]:

@@ -113,14 +113,6 @@ def relative_pose_jacobian(
     return error, (SparseJacobian(6, by_from), SparseJacobian(6, by_to))
 
 
-def gauss_markov_start_jacobian(
-    state: Float[Tensor, "k m"], mean: Float[Tensor, "k m"]
-) -> tuple[Float[Tensor, "k m"], tuple[Jacobian, Jacobian]]:
-    """`gauss_markov_start` and its Jacobians by state and mean."""
-    one = torch.ones_like(state)
-    return state - mean, (SparseJacobian.diagonal(one), SparseJacobian.diagonal(-one))
-
-
 def gauss_markov_step_jacobian(
     before: Float[Tensor, "k m"],
     after: Float[Tensor, "k m"],
@@ -131,18 +123,6 @@ def gauss_markov_step_jacobian(
     by = (-keep, torch.ones_like(keep), keep - 1)
     error = gauss_markov_step(before, after, mean, keep)
     return error, tuple(SparseJacobian.diagonal(entries) for entries in by)
-
-
-def sideways_parting_jacobian(
-    before: Float[Tensor, "k m"],
-    after: Float[Tensor, "k m"],
-    seen: Float[Tensor, " m"],
-    by_before: Float[Tensor, "k m"],
-    by_after: Float[Tensor, "k m"],
-) -> tuple[Float[Tensor, "1 m"], tuple[Tensor, Tensor]]:
-    """`sideways_parting` and its Jacobians by the drift at the two knots."""
-    error = sideways_parting(before, after, seen, by_before, by_after)
-    return error, (by_before[None], by_after[None])
 
 
 def _step(

@@ -49,7 +49,7 @@ def habit_term(facing: Float[Tensor, "n 3"], own: Int[Tensor, " n"], habit: Sign
         (("sign", own), ("size", own)),
         (facing, usual),
         weight=(1 / sigma).expand(len(own), 5),
-        jacobian=sign_habit_jacobian,
+        takes_rows=True,
     )
 
 
@@ -83,24 +83,3 @@ def sign_place(
 ) -> Float[Tensor, "3 *#rows"]:
     """Displacement of a point of a sign's plane from where a survey puts it in the world [m]."""
     return corner_world(T_world_sign, template * size) - surveyed
-
-
-def sign_habit_jacobian(
-    T_world_sign: Float[Tensor, "4 4 m"],
-    size: Float[Tensor, "2 m"],
-    facing: Float[Tensor, "3 m"],
-    typical_size: Float[Tensor, "2 m"],
-) -> tuple[Float[Tensor, "5 m"], tuple[Tensor, Tensor]]:
-    """`sign_habit` and its Jacobians by sign pose and relative size."""
-    R = T_world_sign[:3, :3]
-    across, up = components(R, facing), R[2]
-    by_sign = size.new_zeros(5, 6, size.shape[1])
-    # A turn by w takes the axes x and z to x + w_z y - w_y z and z + w_y x - w_x y.
-    by_sign[(0, 0), (4, 5)] = torch.stack((-across[2], across[1]))
-    by_sign[(1, 1), (4, 5)] = torch.stack((-up[2], up[1]))
-    by_sign[(2, 2), (3, 4)] = torch.stack((-up[1], up[0]))
-    by_size = torch.eye(5, 2, dtype=size.dtype, device=size.device).roll(3, 0)
-    return sign_habit(T_world_sign, size, facing, typical_size), (
-        by_sign,
-        by_size[..., None].expand(5, 2, size.shape[1]),
-    )

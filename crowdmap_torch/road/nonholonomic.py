@@ -17,7 +17,7 @@ from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.noise.positioning import DriftPathConfig, PositioningNoise, knot_count
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.ranges import Settings, Sigma
-from crowdmap_torch.residuals.pose import sideways_parting, sideways_parting_jacobian
+from crowdmap_torch.residuals.pose import sideways_parting
 from crowdmap_torch.road.dead_reckoning import dead_reckon, direction, fit_slip, headings
 from crowdmap_torch.road.ego_motion import EgoMotion, motion_of
 from crowdmap_torch.tables import Journey
@@ -105,5 +105,5 @@ def nonholonomic_term(
         (("drift", before), ("drift", after)),
         (seen, by_before, by_after),
         weight=1 / sigma,
-        jacobian=sideways_parting_jacobian,
+        takes_rows=True,
     )

@@ -117,7 +117,8 @@ def outliers(
     matrix = corners.matrix.clone()
     # The pixel is what the first two rows take off, in units of the depth, which is the third.
     matrix[:, :2] -= push[detection][..., None] * corners.matrix[:, 2:]
-    return replace(corners, matrix=matrix), corners[~is_far[detection]]
+    px = corners.px + push[detection]
+    return replace(corners, px=px, matrix=matrix), corners[~is_far[detection]]
 
 
 def a_metre_off(first: FirstMap, generator: torch.Generator) -> FirstMap:

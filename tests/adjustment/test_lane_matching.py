@@ -16,6 +16,7 @@ from crowdmap_torch.adjustment.lane_matching import (
     nearest_lanes,
     sample_parameters,
 )
+from crowdmap_torch.adjustment.lenses import seen_points
 from crowdmap_torch.adjustment.observations import LanePointObservations
 from crowdmap_torch.geometry import camera, se3, spline_basis
 from crowdmap_torch.geometry.camera import Camera
@@ -90,7 +91,7 @@ def test_samples_reach_from_end_to_end_without_gaps(lanes: Lanes):
 # The closest point of the projected spline.
 
 
-def seen_points(lanes: Lanes, T: Tensor, aside: Tensor, x: Tensor, lane: int) -> Tensor:
+def pixels_beside(lanes: Lanes, T: Tensor, aside: Tensor, x: Tensor, lane: int) -> Tensor:
     """Raw pixels of points `aside` metres to the left of a lane, at these x."""
     fine = torch.linspace(0, 1, 20001, dtype=torch.float64)
     t = fine * (int(lanes.control_count[lane]) - 1)
@@ -110,8 +111,15 @@ def observe(px: Tensor) -> LanePointObservations:
     zero = torch.zeros(len(px), dtype=torch.int64)
     down = RIG.road_normal_camera.expand(len(px), 3)
     one = torch.ones(len(px), dtype=torch.float64)
-    matrix = camera.observation_matrix(RIG.camera, px, ideal)
-    return LanePointObservations(zero, zero, zero, ideal, matrix, down, one * HEIGHT, one * 0.05)
+    return LanePointObservations(
+        **seen_points(RIG.camera, 0, px, ideal),
+        frame=zero,
+        journey=zero,
+        detection=zero,
+        normal_camera=down,
+        camera_height=one * HEIGHT,
+        height_sigma=one * 0.05,
+    )
 
 
 def projected_errors(rows: LanePointObservations, T: Tensor, point: Tensor) -> Tensor:
@@ -125,7 +133,7 @@ def test_follow_ends_at_the_closest_point_of_the_projected_spline(lanes: Lanes, 
     T = camera_at(5.0)
     x = torch.linspace(16, 40, 15, dtype=torch.float64)
     aside = 0.25 * torch.sin(3 * x)
-    rows = observe(seen_points(lanes, T, aside, x, lane))
+    rows = observe(pixels_beside(lanes, T, aside, x, lane))
     count = lanes.control_count
     last = int(count[lane]) - 1
     # From half a knot beside, several metres along the marker.
@@ -160,7 +168,7 @@ def test_follow_ends_at_the_closest_point_of_the_projected_spline(lanes: Lanes, 
 def test_follow_stays_where_the_match_is_right_already(lanes: Lanes):
     T = camera_at(5.0)
     x = torch.linspace(16, 40, 10, dtype=torch.float64)
-    rows = observe(seen_points(lanes, T, 0.1 + 0 * x, x, 2))
+    rows = observe(pixels_beside(lanes, T, 0.1 + 0 * x, x, 2))
     count = lanes.control_count
     coefficient = spline_basis.to_coefficients_flat(lanes.control.point_world, count)
     nothing = torch.zeros(10, 2, dtype=torch.float64)
@@ -175,7 +183,7 @@ def test_points_beyond_the_end_or_behind_the_camera_are_not_valid(lanes: Lanes):
     short = make.lanes([make.straight(0.0, start=15, end=25, points=3)])
     T = camera_at(5.0)
     x = torch.tensor([10.0, 20.0, 35.0], dtype=torch.float64)
-    rows = observe(seen_points(lanes, T, 0 * x, x, 0))
+    rows = observe(pixels_beside(lanes, T, 0 * x, x, 0))
     count = short.control_count
     coefficient = spline_basis.to_coefficients_flat(short.control.point_world, count)
     nothing = torch.zeros(3, 2, dtype=torch.float64)
@@ -192,7 +200,7 @@ def test_a_match_at_the_end_of_a_spline_does_not_come_and_go(lanes: Lanes):
     make = Builder()
     T = camera_at(5.0)
     x = torch.tensor([20.0], dtype=torch.float64)
-    rows = observe(seen_points(lanes, T, 0 * x, x, 0))
+    rows = observe(pixels_beside(lanes, T, 0 * x, x, 0))
     nothing = torch.zeros(1, 2, dtype=torch.float64)
     valid = torch.ones(1, dtype=torch.bool)
     # A step moves the end a few centimetres to and fro across the point; then it moves away, and back.

@@ -218,15 +218,17 @@ def test_journeys_without_signs_give_no_rows(signs: Signs):
     )
 
 
-def test_of_boxes_the_centre_counts_and_the_corners_hardly(signs: Signs):
-    journey, association = seen(signs, make_rig(), metres(1, 1.0), torch.zeros(6).long())
+@pytest.mark.parametrize("distortion", [None, LENS], ids=["pinhole", "distorted"])
+def test_of_boxes_the_centre_counts_and_the_corners_hardly(signs: Signs, distortion):
+    rig = make_rig(distortion)
+    journey, association = seen(signs, rig, metres(1, 1.0), torch.zeros(6).long())
     rectangle = SHAPES.index("rectangle")
     k = signs.shape.tolist().index(rectangle)
     px = journey.signs.corners_px.clone()
     low, high = px[k].amin(0), px[k].amax(0)
     corner = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]] + [[0, 1]] * 4, dtype=torch.float64)
     px[k] = low + corner * (high - low)
-    ideal = (px - torch.tensor([639.5, 399.5])) / 900
+    ideal, _ = camera.unproject(rig.camera, px)
     boxed = replace(journey.signs, corners_px=px, corners_ideal=ideal)
     rows = corner_observations([replace(journey, signs=boxed)], [association], signs, box_sigma=0.5)
     mine = rows[rows.sign == k]
@@ -234,9 +236,8 @@ def test_of_boxes_the_centre_counts_and_the_corners_hardly(signs: Signs):
     torch.testing.assert_close(mine.loose_px[:4], (high - low).max() / 4 * torch.ones(4).double())
     assert mine.loose_px[4] == 0
     torch.testing.assert_close(mine.template[4], torch.zeros(2).double(), rtol=0, atol=1e-12)
-    # On the axis through the box's centre the error is zero.
-    centre = (low + high) / 2
-    ray = torch.cat(((centre - torch.tensor([639.5, 399.5])) / 900, torch.ones(1).double()))
+    # On the ray between those of the box's corners the error is zero.
+    ray = torch.cat((ideal[k, :4].mean(0), torch.ones(1).double()))
     error = pixel_error(7 * ray, mine.matrix[4])
     torch.testing.assert_close(error, torch.zeros(2).double(), rtol=0, atol=1e-9)
     others = rows[rows.sign != k]

@@ -12,7 +12,7 @@ from functools import cache
 import pytest
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
+from torch.func import jacfwd, vmap
 
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.optim.linearize import autograd_jacobians, dense, residuals
@@ -136,7 +136,7 @@ def test_closed_jacobians_are_those_of_forward_and_reverse_autograd(residual):
     term, values = term_of(residual)
     variables = variables_of(residual)
     blocks, kinds = tuple(values.values()), tuple(variables.values())
-    error, forward = autograd_jacobians(term, variables, values)
+    error, reverse = autograd_jacobians(term, variables, values)
 
     def moved(tangents, blocks, constants):
         at = (
@@ -146,9 +146,9 @@ def test_closed_jacobians_are_those_of_forward_and_reverse_autograd(residual):
         return residual(*at, *constants)
 
     zero = tuple(torch.zeros(ROWS, kind.tangent_dim, dtype=torch.float64) for kind in kinds)
-    reverse = vmap(jacrev(moved), out_dims=-1)(zero, blocks, term.constants)
+    forward = vmap(jacfwd(moved), out_dims=-1)(zero, blocks, term.constants)
     rows_last = (x.movedim(0, -1).contiguous() for x in (*blocks, *term.constants))
-    value, closed = (error, forward) if term.jacobian is None else term.jacobian(*rows_last)
+    value, closed = (error, reverse) if term.jacobian is None else term.jacobian(*rows_last)
     torch.testing.assert_close(value, residuals(term, values).mT)
     torch.testing.assert_close(value, error)
     for J, by_forward, by_reverse in zip(dense(closed), forward, reverse, strict=False):

@@ -19,14 +19,16 @@ def corners() -> CornerObservations:
     detection = 2 * (torch.arange(rows) // 4)
     matrix = torch.eye(3, dtype=torch.float64).repeat(rows, 1, 1)
     others = {f.name: torch.zeros(rows, dtype=torch.float64) for f in fields(CornerObservations)}
-    others |= {"frame": detection, "sign": detection, "template": torch.zeros(rows, 2).double()}
+    others |= {"frame": detection, "sign": detection, "lens": detection}
+    others |= {name: torch.zeros(rows, 2).double() for name in ("template", "px", "ideal", "bend")}
     return CornerObservations(**{**others, "detection": detection, "matrix": matrix})
 
 
 def test_outliers_are_whole_detections_10_to_40_pixels_off(corners: CornerObservations, generator):
     far, left = convergence.outliers(corners, generator)
     # The projection of the optical axis is the pixel by which a detection was moved.
-    push = (far.matrix - corners.matrix)[:, :2, 2]
+    push = (corners.matrix - far.matrix)[:, :2, 2]
+    assert torch.equal(far.px - corners.px, push)
     length = push.norm(dim=1)
     is_far = length > 0
     assert (push.view(-1, 4, 2) == push.view(-1, 4, 2)[:, :1]).all()

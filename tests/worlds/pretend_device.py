@@ -100,8 +100,8 @@ def pretend_device() -> Iterator[Transfers]:
     with (
         mock.patch.object(torch.cuda, "_lazy_init", lambda: None),
         mock.patch.object(torch.cuda, "is_available", lambda: True),
-        _Operations(transfers),
-        _Calls(transfers),
+        _Operations(transfers) as operations,
+        _Calls(transfers, operations),
     ):
         yield transfers
     torch.__future__.set_overwrite_module_params_on_conversion(overwrites)
@@ -113,6 +113,8 @@ class _Operations(TorchDispatchMode):
     def __init__(self, transfers: Transfers) -> None:
         super().__init__()
         self.transfers = transfers
+        self.goes_back = False
+        """Whether derivatives are taken there: what is zero among them is made by torch itself, as if here."""
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         """Runs `func` where its tensors are."""
@@ -146,7 +148,7 @@ class _Operations(TorchDispatchMode):
         if name == "copy_" and moves:
             self._count(tensors[1], isinstance(tensors[0], PretendTensor))
             return args[0]
-        if not there and asked != "cuda":
+        if not there and asked != "cuda" and not (self.goes_back and not tensors):
             return out
         out = tree_map_only(Tensor, PretendTensor, out)
         return return_and_correct_aliasing(func, args, kwargs, out) if there else out
@@ -159,9 +161,10 @@ class _Operations(TorchDispatchMode):
 class _Calls(TorchFunctionMode):
     """What torch does in C++ before an operation is dispatched: moving, making tensors of numbers and numbers of tensors."""
 
-    def __init__(self, transfers: Transfers) -> None:
+    def __init__(self, transfers: Transfers, operations: _Operations) -> None:
         super().__init__()
         self.transfers = transfers
+        self.operations = operations
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         """Does the same by operations."""
@@ -170,6 +173,11 @@ class _Calls(TorchFunctionMode):
             return DEVICE
         if func == _GET_IS_CUDA:
             return _is_there(args[0])
+        if func is torch.autograd.grad:
+            with mock.patch.object(
+                self.operations, "goes_back", any(map(_is_there, tree_leaves(args[0])))
+            ):
+                return func(*args, **kwargs)
         if func in (torch.tensor, torch.as_tensor, Tensor.new_tensor):
             return self._made(func, args, kwargs)
         if func in (Tensor.to, Tensor.cpu, Tensor.cuda):

@@ -79,15 +79,14 @@ def assemble(
 def _computed(
     linearize: _Linearize[_Blocks], problem: Problem, pieces: list[CostTerm], values: Values
 ) -> Iterable[_Blocks]:
-    """Every piece of a term linearised, in order, on all cores where the term brings its own Jacobian."""
+    """Every piece of a term linearised, in order, on all cores."""
     kinds = dict(problem.variables)
 
     def one(piece: CostTerm) -> _Blocks:
         return linearize(piece, kinds, values)
 
-    if not pieces or pieces[0].jacobian is None:
-        # Forward-mode autograd is of one thread at a time.
-        return map(one, pieces)
+    if not pieces:
+        return ()
     return in_order(one, pieces, pieces[0].slots[0][1].device)
 
 
