@@ -9,18 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import eigsh
 from sklearn.cluster import KMeans
 from torch import Tensor
 
-from crowdmap_torch.ranges import Count, RoundsOrNone, Settings, Share
+from crowdmap_torch.clustering.eigenpairs import leading_eigenpairs
+from crowdmap_torch.clustering.graph import Graph, connected_components, parts, symmetric_graph
+from crowdmap_torch.ranges import Count, Range, RoundsOrNone, Settings, Share
 
 LABEL_METHODS = ("kmeans", "sign_code")
 
@@ -40,8 +39,8 @@ class SpectralConfig(Settings):
     """Further k-means runs with random seeds, beside the one started from the most orthogonal rows."""
     dense_limit: Count = 256
     """Components up to this many nodes are decomposed whole; above, only the leading eigenpairs are computed."""
-    leading: Count = 48
-    """Eigenpairs computed of larger components."""
+    leading: Annotated[int, Range(2, 10**4, "eigenpairs: the first alone says nothing")] = 48
+    """Eigenpairs computed of larger components; those up to as many nodes are decomposed whole too."""
     cut_below: Share = 0.02
     """A larger component is cut in two while even its last leading eigenvalue is below this: too many."""
 
@@ -50,6 +49,11 @@ class SpectralConfig(Settings):
         super().__post_init__()
         if self.labels not in LABEL_METHODS:
             raise ValueError(f"labels: expected one of {LABEL_METHODS}, found {self.labels!r}")
+
+    @property
+    def whole_limit(self) -> int:
+        """Most nodes of a component that is decomposed whole."""
+        return max(self.dense_limit, self.leading)
 
 
 @dataclass(frozen=True)
@@ -137,47 +141,19 @@ def cluster_graph(
     Each pair of nodes may appear once, in either order; a node is similar to itself by 1. Edges of similarity zero are
     no edges. The number of clusters of each connected component comes from the gap of its own eigenvalues.
     """
-    device, dtype = edge.device, similarity.dtype
-    matrix = _symmetric(edge, similarity, n)
-    _, component = connected_components(matrix, directed=False)
-    spectra: list[Tensor] = []
-    label = torch.zeros(n, dtype=torch.int64)
-    piece = torch.from_numpy(component.astype(np.int64))
-    free = 0  # the first label not yet used
-
-    small, large = _by_size(component, config.dense_limit)
-    pieces = int(piece.max()) + 1 if n else 0
-    while large:
-        nodes = large.pop()
-        values, vectors = _leading_pairs(matrix[nodes][:, nodes], config.leading)
-        if values[-1] < config.cut_below:
-            for part in _fiedler_cut(matrix, nodes, vectors[:, 1]):
-                piece[torch.from_numpy(part)] = pieces
-                pieces += 1
-                (small if len(part) <= config.dense_limit else large).append(part)
-            continue
-        spectra.append(torch.from_numpy(values).to(dtype))
-        # The value behind the last leading one is not known, so ending there is no answer.
-        count = int(np.argmax(np.diff(values))) + 1
-        found = _labels(torch.from_numpy(vectors[:, :count]), config, generator)
-        label[torch.from_numpy(nodes)] = free + found
-        free += int(found.max()) + 1
-    for members in _batches(sorted(small, key=len)):
-        laplacian, size = _padded_laplacians(matrix, members, device=device, dtype=dtype)
-        values, vectors = torch.linalg.eigh(laplacian)
-        counts = eigengap(values, size)
-        spectra.append(values[values < 0.5 * (_PADDING + 2)].cpu())
-        for b, nodes in enumerate(members):
-            found = _labels(vectors[b, : len(nodes), : int(counts[b])], config, generator)
-            label[torch.from_numpy(nodes)] = free + found.cpu()
-            free += int(found.max()) + 1
-    label = renumber(label)
+    graph = symmetric_graph(edge, similarity, n)
+    piece = connected_components(graph.row, graph.column, n)
+    found = _Found(n)
+    piece, pieces = _label_large(graph, piece, found, config, generator)
+    _label_small(graph, piece, pieces, found, config, generator)
+    label = renumber(found.label)
+    spectra = found.spectra
     eigenvalues = torch.cat(spectra).sort().values if spectra else similarity.new_zeros(0)
     return SpectralClusters(
-        label=label.to(device),
+        label=label.to(edge.device),
         count=int(label.max()) + 1 if n else 0,
-        component=renumber(piece).to(device),
-        eigenvalues=eigenvalues.to(device),
+        component=renumber(piece),
+        eigenvalues=eigenvalues.to(edge.device),
     )
 
 
@@ -203,98 +179,148 @@ def _labels(
     return kmeans_labels(vectors, restarts=config.restarts, generator=generator)
 
 
-def _symmetric(
-    edge: Int[Tensor, "m 2"], similarity: Float[Tensor, " m"], n: int
-) -> sparse.csr_matrix:
-    i, j = edge.detach().cpu().numpy().T
-    weight = similarity.detach().cpu().numpy()
-    keep = (weight > 0) & (i != j)
-    i, j, weight = i[keep], j[keep], weight[keep]
-    diagonal = np.arange(n)
-    rows = np.concatenate((i, j, diagonal))
-    columns = np.concatenate((j, i, diagonal))
-    values = np.concatenate((weight, weight, np.ones(n, dtype=weight.dtype)))
-    return sparse.csr_matrix((values, (rows, columns)), shape=(n, n))
+class _Found:
+    """Labels as they are found, piece by piece, on the CPU, and the spectra they were read from."""
+
+    def __init__(self, n: int) -> None:
+        self.label = torch.zeros(n, dtype=torch.int64)
+        self.spectra: list[Float[Tensor, " _"]] = []
+        self._free = 0
+
+    def add(self, nodes: Int[Tensor, " k"], own: Int[Tensor, " k"]) -> None:
+        """The labels 0, 1, ... of one piece's nodes."""
+        self.label[nodes] = self._free + own
+        self._free += int(own.max()) + 1
 
 
-def _by_size(component: np.ndarray, dense_limit: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Nodes of each component: those small enough for a dense decomposition, and the others."""
-    order = np.argsort(component, kind="stable")
-    sizes = np.bincount(component) if len(component) else np.zeros(0, dtype=np.int64)
-    groups = np.split(order, np.cumsum(sizes)[:-1]) if len(sizes) else []
-    return (
-        [nodes for nodes in groups if len(nodes) <= dense_limit],
-        [nodes for nodes in groups if len(nodes) > dense_limit],
-    )
+def _label_large(
+    graph: Graph,
+    piece: Int[Tensor, " n"],
+    found: _Found,
+    config: SpectralConfig,
+    generator: torch.Generator | None,
+) -> tuple[Int[Tensor, " n"], int]:
+    """Labels the large components by their leading eigenpairs; the pieces that are left after cuts, and their number."""
+    piece, most = piece.clone(), config.whole_limit
+    size = torch.bincount(piece)
+    pieces = len(size)
+    large = list(parts(graph, renumber(piece.masked_fill(size[piece] <= most, -1))))
+    while large:
+        part = large.pop()
+        pairs = leading_eigenpairs(part, config.leading, crowded_below=config.cut_below)
+        if pairs.crowded:
+            for half in _fiedler_cut(part, pairs.vectors):
+                piece[half.node] = pieces
+                pieces += 1
+                if half.size > most:
+                    large.append(half)
+            continue
+        found.spectra.append(pairs.values.cpu())
+        found.add(part.node.cpu(), _labels(pairs.vectors.cpu(), config, generator))
+    return piece, pieces
 
 
-def _batches(groups: list[np.ndarray]) -> Iterator[list[np.ndarray]]:
-    """Runs of groups (ascending in size) whose padding stays within a quarter and whose matrices fit the batch."""
+def _label_small(
+    graph: Graph,
+    piece: Int[Tensor, " n"],
+    pieces: int,
+    found: _Found,
+    config: SpectralConfig,
+    generator: torch.Generator | None,
+) -> None:
+    """Labels the small pieces, in batches of like size."""
+    sizes = torch.bincount(piece, minlength=pieces)
+    # A number that was cut up has no nodes left.
+    small = torch.nonzero((sizes > 0) & (sizes <= config.whole_limit))[:, 0]
+    small = small[sizes[small].argsort(stable=True)]
+    rank = torch.full_like(sizes, -1)
+    rank[small] = torch.arange(len(small), device=small.device)
+    batches = _Batches.of(graph, rank[piece], sizes[small])
+    node, size = batches.node.cpu(), sizes[small].tolist()
+    first = 0
+    for start, stop in _runs(size):
+        laplacian, own = batches.laplacians(start, stop)
+        values, vectors = torch.linalg.eigh(laplacian)
+        counts = eigengap(values, own).tolist()
+        found.spectra.append(values[values < 0.5 * (_PADDING + 2)].cpu())
+        vectors = vectors.cpu()
+        for b, (n, count) in enumerate(zip(size[start:stop], counts, strict=True)):
+            label = _labels(vectors[b, :n, :count], config, generator)
+            found.add(node[first : first + n], label)
+            first += n
+
+
+def _runs(size: list[int]) -> Iterator[tuple[int, int]]:
+    """Ranges of pieces (ascending in size) whose padding stays within a quarter and whose matrices fit the batch."""
     start = 0
-    while start < len(groups):
-        stop, widest = start, len(groups[start]) + max(1, len(groups[start]) // 4)
+    while start < len(size):
+        stop, widest = start, size[start] + max(1, size[start] // 4)
         while (
-            stop < len(groups)
-            and len(groups[stop]) <= widest
-            and (stop - start) * len(groups[stop]) ** 2 < _BATCH_ELEMENTS
+            stop < len(size)
+            and size[stop] <= widest
+            and (stop - start) * size[stop] ** 2 < _BATCH_ELEMENTS
         ):
             stop += 1
-        yield groups[start:stop]
+        yield start, stop
         start = stop
 
 
-def _padded_laplacians(
-    matrix: sparse.csr_matrix,
-    members: list[np.ndarray],
-    *,
-    device: torch.device,
-    dtype: torch.dtype,
-) -> tuple[Float[Tensor, "b p p"], Int[Tensor, " b"]]:
-    """Normalised Laplacians of several components; padded rows are alone, their eigenvalue lies behind all others."""
-    size = torch.tensor([len(nodes) for nodes in members])
-    width = int(size.max())
-    nodes = np.concatenate(members)
-    batch = np.repeat(np.arange(len(members)), size.numpy())
-    place = np.arange(len(nodes)) - np.repeat(np.cumsum(size.numpy()) - size.numpy(), size.numpy())
-    where = np.full(len(matrix.indptr) - 1, -1, dtype=np.int64)
-    where[nodes] = np.arange(len(nodes))
-    block = sparse.coo_matrix(matrix[nodes])
-    i, j = block.row, where[block.col]
-    # A piece cut out of a larger component has edges that lead out of it.
-    inside = (j >= 0) & (batch[i] == batch[j])
-    i, j = i[inside], j[inside]
-    dense = torch.zeros(len(members), width, width, dtype=dtype)
-    dense[batch[i], place[i], place[j]] = torch.from_numpy(block.data[inside]).to(dtype)
-    rank = torch.arange(width)
-    is_padding: Bool[Tensor, "b p"] = rank >= size[:, None]
-    dense[:, rank, rank] = torch.where(is_padding, 1.0, dense[:, rank, rank])
-    laplacian = normalized_laplacian(dense)
-    laplacian[:, rank, rank] = torch.where(is_padding, _PADDING, laplacian[:, rank, rank])
-    return laplacian.to(device), size.to(device)
+@dataclass(frozen=True)
+class _Batches:
+    """Pieces of a graph side by side, ascending in size."""
+
+    size: Int[Tensor, " p"]
+    node: Int[Tensor, " n"]
+    """Nodes, piece by piece."""
+    piece: Int[Tensor, " m"]
+    """Piece of each edge within one, ascending."""
+    row: Int[Tensor, " m"]
+    """Place of its row within the piece."""
+    column: Int[Tensor, " m"]
+    weight: Float[Tensor, " m"]
+
+    @staticmethod
+    def of(graph: Graph, rank: Int[Tensor, " n"], size: Int[Tensor, " p"]) -> _Batches:
+        """`rank` is each node's piece, -1 for none, and `size` the nodes of each."""
+        node = rank.argsort(stable=True)[int((rank < 0).sum()) :]
+        place = torch.zeros_like(rank)
+        start = size.cumsum(0) - size
+        place[node] = torch.arange(len(node), device=node.device) - start[rank[node]]
+        # A piece cut out of a larger component has edges that lead out of it.
+        here = rank[graph.row]
+        inner = torch.nonzero((here == rank[graph.column]) & (here >= 0))[:, 0]
+        inner = inner[here[inner].argsort(stable=True)]
+        row, column = place[graph.row[inner]], place[graph.column[inner]]
+        return _Batches(size, node, here[inner], row, column, graph.weight[inner])
+
+    def laplacians(self, start: int, stop: int) -> tuple[Float[Tensor, "b p p"], Int[Tensor, " b"]]:
+        """Normalised Laplacians of a range of pieces, and their sizes.
+
+        Padded rows are alone, their eigenvalue lies behind all others.
+        """
+        size = self.size[start:stop]
+        width = int(size[-1])
+        low, high = torch.searchsorted(self.piece, size.new_tensor([start, stop])).tolist()
+        batch, i, j = (self.piece[low:high] - start, self.row[low:high], self.column[low:high])
+        dense = self.weight.new_zeros(stop - start, width, width)
+        dense[batch, i, j] = self.weight[low:high]
+        rank = torch.arange(width, device=size.device)
+        is_padding: Bool[Tensor, "b p"] = rank >= size[:, None]
+        diagonal = dense.diagonal(dim1=1, dim2=2)
+        diagonal.masked_fill_(is_padding, 1)
+        laplacian = normalized_laplacian(dense)
+        laplacian.diagonal(dim1=1, dim2=2).masked_fill_(is_padding, _PADDING)
+        return laplacian, size
 
 
-def _leading_pairs(block: sparse.csr_matrix, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest eigenvalues of the normalised Laplacian of one component, ascending, and their vectors."""
-    root = 1 / np.sqrt(np.asarray(block.sum(1)).ravel())
-    scaled = sparse.diags(root) @ block @ sparse.diags(root)
-    # A fixed start makes the answer repeatable; it must not be the first eigenvector itself.
-    start = root * (1 + 0.5 * np.cos(np.arange(len(root)) * 2.399963))
-    pairs: dict[str, Any] = {"k": min(count, len(root) - 1), "which": "LA", "tol": 1e-8}
-    values, vectors = eigsh(scaled, v0=start, **pairs)
-    order = np.argsort(-values)
-    return 1 - values[order], vectors[:, order]
-
-
-def _fiedler_cut(
-    matrix: sparse.csr_matrix, nodes: np.ndarray, fiedler: np.ndarray
-) -> Iterator[np.ndarray]:
+def _fiedler_cut(part: Graph, vectors: Float[Tensor, "n 2"]) -> Iterator[Graph]:
     """The connected parts of a component after it was cut where its second eigenvector changes sign."""
-    for side in (fiedler >= 0, fiedler < 0):
-        half = nodes[side]
-        if len(half):
-            _, part = connected_components(matrix[half][:, half], directed=False)
-            for p in range(part.max() + 1):
-                yield half[part == p]
+    # The first eigenvector is known; where the second value is as small, the two that were found may be any mixture.
+    known = torch.nn.functional.normalize(part.degree().sqrt(), dim=0)
+    rest = vectors - known[:, None] * (known @ vectors)
+    side = rest[:, rest.norm(dim=0).argmax()] >= 0
+    kept = side[part.row] == side[part.column]
+    yield from parts(part, connected_components(part.row[kept], part.column[kept], part.size))
 
 
 def _orthogonal_rows(rows: np.ndarray, count: int) -> np.ndarray:
