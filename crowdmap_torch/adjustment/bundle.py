@@ -32,6 +32,7 @@ from crowdmap_torch.optim.problem import (
 from crowdmap_torch.optim.robust import JointTukey, Tukey, median_scale
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
 from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBackend
+from crowdmap_torch.optim.solvers.elimination import landmark_rank
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.residuals import lane, reprojection, sign_prior
@@ -163,6 +164,15 @@ class Bundle(nn.Module):
         self.register_buffer("match_normal", matches.normal_px.clone())
         self.register_buffer("match_valid", matches.valid.clone())
         self.register_buffer("refreshed", torch.zeros_like(self.judged, dtype=torch.bool))
+        self._plan = self._elimination()
+
+    @torch.no_grad()
+    def _elimination(self) -> EliminationPlan:
+        """Frames hang on the drift's chains, both are eliminated, the biases go last; landmarks ranked as they start."""
+        nodes, seen = self.prior.nodes, {**self._corner_term(1.0), **self._lane_terms(1.0)}
+        plan = EliminationPlan("drift", nodes.journey, "pose", nodes.of_frame, border="bias")
+        values = self.values()
+        return replace(plan, rank=landmark_rank(Problem(self.variables, seen), values, plan))
 
     @property
     def matches(self) -> LaneMatches:
@@ -203,14 +213,12 @@ class Bundle(nn.Module):
             getattr(self, f"delta_{name}").zero_()
 
     def backend(self) -> MapBackend:
-        """The solver's back end: frames hang on the drift's chains, both are eliminated, the biases go last."""
-        nodes = self.prior.nodes
-        plan = EliminationPlan("drift", nodes.journey, "pose", nodes.of_frame, border="bias")
+        """The solver's back end: dense landmarks, or conjugate gradients where there are too many for that."""
         landmarks = ("sign", "size", "lane")
         unknowns = sum(getattr(self, f"delta_{name}").numel() for name in landmarks)
         if unknowns > self.config.dense_unknowns:
-            return ConjugateGradientBackend(plan, samples=self.config.covariance_samples)
-        return BorderedBackend(plan)
+            return ConjugateGradientBackend(self._plan, samples=self.config.covariance_samples)
+        return BorderedBackend(self._plan)
 
     @torch.no_grad()
     def refresh(self) -> bool:

@@ -166,8 +166,9 @@ class JointTukey:
         """The sum over each row's detection."""
         if not len(s):
             return s
-        total = s.new_zeros(int(self.run[-1] - self.run[0]) + 1)
         own = self.run - self.run[0]
+        # As many as there are rows are enough: how many there are is not asked for, which would stop a GPU.
+        total = torch.zeros_like(s)
         return total.index_add_(0, own, s)[own]
 
 

@@ -46,6 +46,8 @@ class Coupling:
     """Columns of the reduced system that the factor touches."""
     landmark: Int[Tensor, "f q"]
     """The same as landmark blocks."""
+    widths: tuple[int, ...]
+    """Columns of each of them."""
     slot: int
     """Slot of the eliminated block."""
 
@@ -109,15 +111,13 @@ def analyse(
     Every row may touch one eliminated block and any landmarks; or one or two eliminated blocks, neighbours of a chain or a
     leaf and the block that carries it, and beside them the chain's own block of the border.
     """
-    where = layout(problem, values, skip=(*plan.first_block, *_named(plan.border)))
-    landmarks = LandmarkBlocks.of(where, plan.chain.device)
+    where, landmarks, couplings, keys = _touched(problem, values, plan)
     owner = plan.owner
-    couplings = _couplings(problem.terms, plan, owner, landmarks)
     k = problem.variables[plan.chains].tangent_dim
     # About as many as there are drives: those that see one stretch of road at the same step.
     size = group_size or min(64, max(4, plan.chain_count))
-    keys = _coupled_landmarks(couplings, landmarks)
-    builder = WindowBuilder(landmarks, _rank(keys, landmarks), len(owner), size, k, batch_bytes)
+    rank = _rank(keys, landmarks) if plan.rank is None else plan.rank
+    builder = WindowBuilder(landmarks, rank, len(owner), size, k, batch_bytes)
     windows = [
         builder.windows(node, neighbour, coupled)
         for node, neighbour, coupled in _rounds(keys, plan, landmarks.count)
@@ -132,13 +132,35 @@ def analyse(
         where=where,
         couplings=couplings,
         rounds=tuple(builder.round(*of_round, place) for of_round in windows),
-        factor_rows={name: builder.rows(c.block, c.landmark) for name, c in couplings.items()},
+        factor_rows={
+            name: builder.rows(c.block, c.landmark, c.widths) for name, c in couplings.items()
+        },
         order=order,
         place=place[:-1],
         right_side_row=builder.first_row[:-1],
         store_rows=builder.store_rows,
         owner=owner,
     )
+
+
+def landmark_rank(problem: Problem, values: Values, plan: EliminationPlan) -> Float[Tensor, " q"]:
+    """A position of every landmark on a line, such that landmarks coupled to one block are near each other.
+
+    Worked out on the CPU. It does not have to be that of the very rows: what serves them now serves them after a few steps
+    too, when some have gone over to a neighbouring landmark.
+    """
+    _, landmarks, _, keys = _touched(problem, values, plan)
+    return _rank(keys, landmarks)
+
+
+def _touched(
+    problem: Problem, values: Values, plan: EliminationPlan
+) -> tuple[Layout, LandmarkBlocks, dict[str, Coupling], Int[Tensor, " keys"]]:
+    """The reduced system, its blocks, and what of it the eliminated blocks are coupled to, by term and as keys."""
+    where = layout(problem, values, skip=(*plan.first_block, *_named(plan.border)))
+    landmarks = LandmarkBlocks.of(where, plan.chain.device)
+    couplings = _couplings(problem.terms, plan, plan.owner, landmarks)
+    return where, landmarks, couplings, _coupled_landmarks(couplings, landmarks)
 
 
 def _named(name: str | None) -> tuple[str, ...]:
@@ -202,19 +224,17 @@ def _coupling(
     column = torch.cat(
         [
             landmarks.column[index[first]][:, None]
-            + torch.arange(_width(landmarks, other), device=block.device)
+            + torch.arange(landmarks.width_of[other], device=block.device)
             for (other, _), index in zip(
                 (s for i, s in enumerate(term.slots) if i != slot), others, strict=True
             )
         ],
         dim=-1,
     )
-    return Coupling(order, factor_of_row, block[first], column, landmark, slot)
-
-
-def _width(landmarks: LandmarkBlocks, name: str) -> int:
-    first = landmarks.first[name]
-    return int(landmarks.width[first]) if first < len(landmarks.width) else 0
+    widths = tuple(
+        landmarks.width_of[other] for i, (other, _) in enumerate(term.slots) if i != slot
+    )
+    return Coupling(order, factor_of_row, block[first], column, landmark, widths, slot)
 
 
 def _coupled_landmarks(
@@ -227,7 +247,7 @@ def _coupled_landmarks(
 
 
 def _rank(keys: Int[Tensor, " keys"], landmarks: LandmarkBlocks) -> Float[Tensor, " q"]:
-    """A position of every landmark on a line, such that landmarks coupled to one block are near each other."""
+    """`landmark_rank`, of couplings as keys."""
     count = landmarks.count
     # Blocks of a chain are coupled to nearly what their neighbours are: a few of them together tell the same.
     row, column = (keys // count // 8).cpu().numpy(), (keys % count).cpu().numpy()

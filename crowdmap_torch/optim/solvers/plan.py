@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -27,6 +27,8 @@ class EliminationPlan:
     """Block of the chains that each leaf hangs on."""
     border: str | None = None
     """Variable of which each chain has a block of its own, that of its number; None: there is none."""
+    rank: Float[Tensor, " q"] | None = None
+    """A position of every landmark on a line (`landmark_rank`); None: found whenever rows touch other landmarks."""
 
     def __post_init__(self) -> None:
         """Refuses chains in pieces, and leaves that hang on nothing."""

@@ -8,6 +8,7 @@ its window, and is as wide as a block; batch follows batch in it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -43,6 +44,8 @@ class LandmarkBlocks:
     column: Int[Tensor, " q"]
     """First column of every block."""
     width: Int[Tensor, " q"]
+    width_of: dict[str, int]
+    """Of the blocks of each variable."""
     dim: int
 
     @classmethod
@@ -55,7 +58,10 @@ class LandmarkBlocks:
             columns.append(offset)
             widths.append(torch.full_like(offset, where.tangent_dim[name]))
         none = torch.zeros(0, dtype=torch.long, device=device)
-        return cls(first, torch.cat([none, *columns]), torch.cat([none, *widths]), where.dim)
+        width_of = {name: where.tangent_dim[name] for name in first}
+        return cls(
+            first, torch.cat([none, *columns]), torch.cat([none, *widths]), width_of, where.dim
+        )
 
     @property
     def count(self) -> int:
@@ -135,7 +141,8 @@ class WindowBuilder:
                 self.first_row[table[part]] = rows
                 self.group_of[table[part]] = self.groups + part[:, None].expand(-1, size)
                 self.batch_rows.append(self.store_rows)
-                batches.append((table[part], _expand(of, landmark, start, part, w, self)))
+                columns = _expand(of, landmark, start, part, w, group_count, self)
+                batches.append((table[part], columns))
                 self.store_rows += len(part) * size * w
         self.first_row[self.n] = self.group_of[self.n] = -1
         self.groups += group_count
@@ -175,13 +182,11 @@ class WindowBuilder:
         good = has & (is_gradient | (found & known[:, None, :, None]))
         return torch.where(good, row, self.store_rows)
 
-    def rows(self, block: Tensor, landmark: Tensor) -> Tensor:
-        """Store rows of factors' columns, one behind the other."""
+    def rows(self, block: Tensor, landmark: Tensor, widths: Sequence[int]) -> Tensor:
+        """Store rows of factors' columns, one behind the other; the landmarks have these widths."""
         parts = []
-        for at in range(landmark.shape[1]):
-            lm = landmark[:, at]
+        for lm, width in zip(landmark.unbind(1), widths, strict=True):
             place, _ = self._place(self.group_of[block], lm)
-            width = int(self.landmarks.width[lm[0]]) if len(lm) else 0
             start = self.first_row[block] + place
             parts.append(start[:, None] + torch.arange(width, device=block.device))
         return torch.cat(parts, dim=-1).flatten()
@@ -200,14 +205,19 @@ class WindowBuilder:
 
 
 def _expand(
-    of: Tensor, landmark: Tensor, start: Tensor, part: Tensor, w: int, builder: WindowBuilder
+    of: Tensor,
+    landmark: Tensor,
+    start: Tensor,
+    part: Tensor,
+    w: int,
+    groups: int,
+    builder: WindowBuilder,
 ) -> Tensor:
     """Columns [b, w] of the windows of the groups `part`."""
     landmarks = builder.landmarks
     columns = torch.full((len(part), w), landmarks.dim + 1, dtype=torch.long, device=of.device)
     columns[:, 0] = landmarks.dim
-    row = torch.full((int(of.max()) + 1 if len(of) else 1,), -1, device=of.device)
-    row = torch.cat((row, row.new_full((int(part.max()) + 1,), -1)))
+    row = torch.full((groups,), -1, device=of.device)
     row[part] = torch.arange(len(part), device=of.device)
     mine = torch.nonzero(row[of] >= 0)[:, 0]
     each = landmarks.width[landmark[mine]]
