@@ -261,8 +261,8 @@ def test_kept_factors_give_the_step_of_another_gradient():
 def test_a_rank_that_is_given_changes_the_order_alone():
     built, values, chain = problem([10, 1, 9, 8])
     plan = EliminationPlan("pose", chain)
-    given = replace(plan, rank=landmark_rank(built, values, plan))
-    other = replace(plan, rank=given.rank.flip(0))
+    rank = landmark_rank(built, values, plan)
+    given, other = (replace(plan, rank=r) for r in (rank, rank.flip(0)))
     damping = torch.tensor([1e-3], dtype=torch.float64)
     own, same, another = (
         ChainBackend(p).assemble(built, values).solve(damping) for p in (plan, given, other)
