@@ -1,8 +1,8 @@
 """Where the camera sits on the vehicle: a fixed kinematic chain from a URDF file.
 
-The only file that imports pytorch_kinematics. Its parser and its transforms are used, not its
-chains: those are built in float32 (rotations off by 5e-8), silently take the first of two roots,
-and treat a joint that moves as if it stood at zero.
+The only file that imports pytorch_kinematics: its parser reads the description, its chain gives the
+forward kinematics. Not used is what makes the one from the other: it builds in float32 (rotations
+off by 5e-8), silently takes the first of two roots, and a joint that moves stands at zero.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from pytorch_kinematics.transforms import Transform3d, quaternion_from_euler
+from pytorch_kinematics import Chain, Transform3d, frame
+from pytorch_kinematics.transforms import quaternion_from_euler
 from pytorch_kinematics.urdf_parser_py.urdf import URDF, Joint, Pose
 from pytorch_kinematics.urdf_parser_py.xml_reflection.core import ParseError
 from torch import Tensor
@@ -48,12 +49,13 @@ def camera_in_link(
                 f"URDF joint {joint.name!r} between {pose_link!r} and {camera_link!r} is "
                 f"{joint.type!r}; expected 'fixed': the camera must not move on the vehicle"
             )
-    T_link_camera = se3.inverse(_pose_of_last(to_pose)) @ _pose_of_last(to_camera)
+    T_top_link, T_top_camera = _forward_kinematics(to_pose, to_camera)
+    T_link_camera = se3.inverse(T_top_link) @ T_top_camera
     R = se3.orthonormalise(T_link_camera[:3, :3])
     return se3.make(R, T_link_camera[:3, 3])
 
 
-_MOST_LINKS = 2000
+_MOST_LINKS = 500
 """A humanoid has a hundred."""
 
 
@@ -116,19 +118,34 @@ def _joints_to_root(parent_joint: dict[str, Joint | None], link: str) -> list[Jo
     return joints
 
 
-def _pose_of_last(joints: list[Joint]) -> Float[Tensor, "4 4"]:
-    """T_first_last along a chain of joints that are listed from the last link upwards."""
-    T = torch.eye(4, dtype=torch.float64)
-    for joint in reversed(joints):
-        T = T @ _joint_transform(joint.origin)
-    return T
+def _forward_kinematics(*paths: list[Joint]) -> Float[Tensor, "n 4 4"]:
+    """The pose of the last link of each path in the first, which all share.
+
+    A path is its fixed joints, listed from the last link upwards.
+    """
+    # Frames go by number: the chain takes names of links for the same that differ in line ends.
+    top = frame.Frame("0", joint=frame.Joint(dtype=torch.float64))
+    ends, count = [], 0
+    for joints in paths:
+        above = top
+        for joint in reversed(joints):
+            count += 1
+            offset = _joint_transform(joint.origin)
+            hinge = frame.Joint(str(joint.name), offset, dtype=torch.float64)
+            below = frame.Frame(str(count), joint=hinge)
+            above.children.append(below)
+            above = below
+        ends.append(above.name)
+    chain = Chain(top, dtype=torch.float64)
+    poses = chain.forward_kinematics_tensor(torch.zeros(1, 0, dtype=torch.float64))
+    return poses[chain.get_frame_indices(*ends), 0]
 
 
-def _joint_transform(origin: Pose | None) -> Float[Tensor, "4 4"]:
+def _joint_transform(origin: Pose | None) -> Transform3d:
     rpy = torch.tensor(_vector(origin, "rpy"), dtype=torch.float64)
     xyz = torch.tensor(_vector(origin, "xyz"), dtype=torch.float64)
     quaternion_wxyz = quaternion_from_euler(rpy, "sxyz")
-    return Transform3d(rot=quaternion_wxyz, pos=xyz, dtype=torch.float64).get_matrix()[0]
+    return Transform3d(rot=quaternion_wxyz, pos=xyz, dtype=torch.float64)
 
 
 def _vector(origin: Pose | None, name: str) -> list[float]:

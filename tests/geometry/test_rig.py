@@ -90,6 +90,39 @@ def test_agrees_with_the_forward_kinematics_of_pytorch_kinematics():
     torch.testing.assert_close(T, expected, atol=1e-6, rtol=0)
 
 
+def test_several_fixed_joints_are_one_transform():
+    numbers = torch.rand(2, 7, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    numbers = 6 * numbers - 3  # metres and radians, all digits of a double
+    links, joints, ends = '<link name="base_link"/>', "", []
+    for arm, origins in zip("ab", numbers.tolist(), strict=True):
+        parent, T = "base_link", torch.eye(4, dtype=torch.float64)
+        for k, (x, y, z, *rpy) in enumerate(origins):
+            name = f"{arm}{k}"
+            xyz, angles = f"{x!r} {y!r} {z!r}", " ".join(map(repr, rpy))
+            links += f'<link name="{name}"/>'
+            joints += joint(f"j_{name}", parent, name, f'<origin xyz="{xyz}" rpy="{angles}"/>')
+            parent, T = name, T @ transform([x, y, z], rpy)
+        ends.append(T)
+    content = urdf(links + joints)
+    T = camera_in_link(content, "base_link", "a6")
+    torch.testing.assert_close(T, ends[0], atol=1e-12, rtol=0)
+    T = camera_in_link(content, "a6", "b6")
+    torch.testing.assert_close(T, se3.inverse(ends[0]) @ ends[1], atol=1e-12, rtol=0)
+
+
+def test_a_mast_of_more_joints_than_anybody_builds_is_no_trouble():
+    count = 499
+    links = "".join(f'<link name="l{k}"/>' for k in range(count + 1))
+    step = '<origin xyz="0.01 0 0"/>'
+    joints = "".join(joint(f"j{k}", f"l{k}", f"l{k + 1}", step) for k in range(count))
+    T = camera_in_link(urdf(links + joints), "l0", f"l{count}")
+    expected = torch.tensor([4.99, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(T[:3, 3], expected, atol=1e-12, rtol=0)
+    one_more = joint("more", f"l{count}", "more", step) + '<link name="more"/>'
+    with pytest.raises(ValueError, match="URDF has 501 links; expected 500 at most"):
+        camera_in_link(urdf(links + joints + one_more), "l0", "l1")
+
+
 def test_rotation_is_orthonormal_to_float64():
     R = camera_in_link(GOOD, "imu", "camera_optical")[:3, :3]
     torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-15, rtol=0)
