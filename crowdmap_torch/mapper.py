@@ -21,6 +21,7 @@ from crowdmap_torch.adjustment.lane_matching import detection_lanes
 from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import cluster_lanes
 from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_lanes
+from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
 from crowdmap_torch.crowd_signs.align import unbiased_poses
 from crowdmap_torch.crowd_signs.complete_tracks import (
     CompletedTracks,
@@ -91,6 +92,8 @@ class FirstMap:
 
     signs: Signs
     lanes: Lanes
+    lane_support: LaneSupport
+    """Which lane each place of the journeys' own lane pieces is of."""
     tentative: Signs
     """Signs that too few journeys saw."""
     crowd: Crowd
@@ -232,12 +235,22 @@ def first_map(
     made = [m.lanes for m in maps]
     if config.crowd.method == "paper2017":
         pieces = concatenate_lanes(made)
-        lanes = cluster_lanes(pieces, config.lane_cluster, generator=generator).heads
+        clusters = cluster_lanes(pieces, config.lane_cluster, generator=generator)
+        lanes = clusters.heads
+        support = support_of_pieces(pieces, clusters.label, config.lane_join.sample_spacing_m)
     else:
         moved = [unbiased_lanes(p, drift) for p, drift in zip(made, drifts, strict=True)]
-        lanes = join_lanes(concatenate_lanes(moved), config.positioning, config.lane_join).lanes
+        joined = join_lanes(concatenate_lanes(moved), config.positioning, config.lane_join)
+        lanes, support = joined.lanes, joined.support
     return FirstMap(
-        found.heads, lanes, found.tentative, crowd, found.associations, drifts, found.completed
+        signs=found.heads,
+        lanes=lanes,
+        lane_support=support,
+        tentative=found.tentative,
+        crowd=crowd,
+        associations=found.associations,
+        drifts=drifts,
+        completed=found.completed,
     )
 
 
@@ -261,6 +274,8 @@ def build_bundle(
         first.drifts,
         config.positioning,
         config.adjust,
+        lane_tracklets=[m.lane_tracklets for m in maps],
+        lane_support=first.lane_support,
         left_out=[outlier.journey for outlier in first.crowd.report.outlier_journeys],
         control=None
         if control is None

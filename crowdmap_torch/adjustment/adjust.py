@@ -19,15 +19,17 @@ from torch import Tensor
 from crowdmap_torch.adjustment.bundle import Bundle, Observations, Priors, Unknowns
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.covariance import MapUncertainty
-from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes
+from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes, supported_lanes
 from crowdmap_torch.adjustment.lenses import lenses_of
 from crowdmap_torch.adjustment.observations import (
     CornerObservations,
+    LanePointObservations,
     corner_observations,
     frame_offsets,
     lane_point_observations,
     spaced_frames,
 )
+from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.pose_prior import DriftNodes, drift_nodes, pose_prior
@@ -39,7 +41,12 @@ from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.residuals.lane import lane_prior, lane_stretch
 from crowdmap_torch.residuals.sign_prior import against_the_drive, habit_term, sign_place
 from crowdmap_torch.survey.control import ControlSigns
-from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Signs
+from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Signs, Tracklets
+
+_SUPPORT_M = 3.0
+"""How far along a lane tracklet a sample of it, which tells its lane, may be away: samples are 2 m apart."""
+_OWN_GATE_M = 1.0
+"""How much further than others a lane point may at first be from the lane that clustering found it to be of [m]."""
 
 
 def build(
@@ -52,19 +59,28 @@ def build(
     positioning: PositioningNoise,
     config: AdjustConfig,
     *,
+    lane_tracklets: Sequence[Tracklets] = (),
+    lane_support: LaneSupport | None = None,
     left_out: Collection[int] = (),
     control: ControlSigns | None = None,
 ) -> Bundle:
     """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
 
     `drifts` are tangents per frame, from the positioning module's pose to the start pose. Journeys `left_out`, by
-    number, have no say. Signs that are `control` points are held where they were surveyed.
+    number, have no say. Signs that are `control` points are held where they were surveyed. Lane points keep the lane that
+    `lane_support` has for the journeys' `lane_tracklets` there, where it has one; others go to the nearest lane.
     """
     given = torch.cat([journey.T_world_camera for journey in journeys])
     drift = torch.cat(list(drifts))
     start = se3.retract(given, drift)
     trusted = _trusted_frames(journeys, left_out)
-    observed = _observations(journeys, roads, signs, lanes, associations, start, config)
+    corners = corner_observations(journeys, associations, signs, box_sigma=config.box_sigma)
+    points, ground = _points_on_ground(journeys, roads, start, config)
+    known = None
+    if lane_support is not None:
+        known = supported_lanes(ground, points, lane_tracklets, lane_support, reach=_SUPPORT_M)
+    points, matches = _matched(points, ground, lanes, known, config)
+    observed = Observations(corners, points, matches, lenses_of(journeys)[0])
     every = torch.arange(len(given), device=given.device)
     observed = observed.renumbered(torch.where(trusted, every, -1))
     kept = _kept_frames(journeys, observed, config)
@@ -221,17 +237,13 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     return lm.changed(state), False
 
 
-def _observations(
+def _points_on_ground(
     journeys: Sequence[Journey],
     roads: Sequence[RoadEstimate],
-    signs: Signs,
-    lanes: Lanes,
-    associations: Sequence[Association],
     T_world_camera: Float[Tensor, "f 4 4"],
     config: AdjustConfig,
-) -> Observations:
-    """Corners of signs, and lane points that lie near a lane of the map with the lane and parameter each starts at."""
-    corners = corner_observations(journeys, associations, signs, box_sigma=config.box_sigma)
+) -> tuple[LanePointObservations, Float[Tensor, "m 3"]]:
+    """Lane points that meet the road near enough, and where in the world they do."""
     points = lane_point_observations(
         journeys,
         roads,
@@ -244,11 +256,27 @@ def _observations(
     distance = h.square().sum(-1) / (h * ray).sum(-1)
     near = (distance > 0) & (distance < config.max_ground_distance_m)
     points, ray, h = points[near], ray[near], h[near]
-    ground = plane.ground_points(ray, h, T_world_camera[points.frame])
+    return points, plane.ground_points(ray, h, T_world_camera[points.frame])
+
+
+def _matched(
+    points: LanePointObservations,
+    ground: Float[Tensor, "m 3"],
+    lanes: Lanes,
+    known: Int[Tensor, " m"] | None,
+    config: AdjustConfig,
+) -> tuple[LanePointObservations, LaneMatches]:
+    """The points that lie near a lane of the map, with the lane and parameter each starts at."""
     lane, t = nearest_lanes(ground, lanes, gate=config.lane_gate_m)
+    if known is not None:
+        # What was told apart in all frames together is not mixed up again by where one frame's pose puts it.
+        gate = config.lane_gate_m + _OWN_GATE_M
+        of_known, at_known = nearest_lanes(ground, lanes, gate=gate, of=known)
+        is_known = known >= 0
+        lane, t = torch.where(is_known, of_known, lane), torch.where(is_known, at_known, t)
     found = lane >= 0
-    matches = LaneMatches(lane[found], t[found], points.ideal[found], found[found])
-    return Observations(corners, points[found], matches, lenses_of(journeys)[0])
+    points = points[found]
+    return points, LaneMatches(lane[found], t[found], points.ideal, found[found])
 
 
 def _fixed_terms(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,9 +12,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from crowdmap_torch.adjustment.observations import LanePointObservations
+from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import plane, spline_basis
 from crowdmap_torch.residuals.reprojection import MIN_DEPTH
-from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Rows
+from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Rows, Tracklets
 
 _STEPS = 4
 """Gauss-Newton steps along the projected spline; it is nearly straight at a lane point's scale."""
@@ -34,9 +37,16 @@ class LaneMatches(Rows):
 
 
 def nearest_lanes(
-    point_world: Float[Tensor, "m 3"], lanes: Lanes, *, gate: float
+    point_world: Float[Tensor, "m 3"],
+    lanes: Lanes,
+    *,
+    gate: float,
+    of: Int[Tensor, " m"] | None = None,
 ) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
-    """Nearest lane within `gate` metres horizontally (-1: none) and the parameter of its nearest sample."""
+    """Nearest lane within `gate` metres horizontally (-1: none) and the parameter of its nearest sample.
+
+    Where lanes are asked for, those or none.
+    """
     count = lanes.control_count
     none = torch.full((len(point_world),), -1, device=point_world.device)
     if not len(lanes) or not len(point_world):
@@ -45,11 +55,58 @@ def nearest_lanes(
     samples = spline_basis.evaluate_flat(lanes.control.point_world, count, t, piece)
     # Heights of a first guess are off by more than markers are apart; a bridge is not.
     squash = samples.new_tensor([1.0, 1.0, 0.3])
-    tree = KDTree((samples * squash).cpu().numpy())
-    distance, index = tree.query((point_world * squash).cpu().numpy(), distance_upper_bound=gate)
-    found = torch.as_tensor(distance, device=t.device) < gate
-    index = torch.as_tensor(index, device=t.device).clamp_max(len(samples) - 1)
+    samples, point_world = samples * squash, point_world * squash
+    if of is not None:
+        samples, point_world = (
+            _layered(x, k, gate) for x, k in ((samples, piece), (point_world, of))
+        )
+    index, found = _nearest(samples, point_world, gate)
     return torch.where(found, piece[index], none), t[index]
+
+
+def supported_lanes(
+    point_world: Float[Tensor, "m 3"],
+    points: LanePointObservations,
+    tracklets: Sequence[Tracklets],
+    support: LaneSupport,
+    *,
+    reach: float,
+) -> Int[Tensor, " m"]:
+    """The lane that clustering found the nearest sample of each point's own tracklet to be of.
+
+    -1 where that is none, where the point is of no tracklet, or where no sample of it is within `reach` metres.
+    """
+    none = torch.full_like(points.detection, -1)
+    if not len(points) or not len(support):
+        return none
+    count = [len(one.label) for one in tracklets]
+    first = torch.tensor([0, *accumulate(count)], device=none.device)[:-1]
+    tracklet = torch.cat([one.label for one in tracklets])[first[points.journey] + points.detection]
+    every = 1 + int(torch.maximum(tracklet.max(), support.tracklet.max()))
+    sample = _layered(support.point_world, support.journey * every + support.tracklet, reach)
+    index, found = _nearest(
+        sample, _layered(point_world, points.journey * every + tracklet, reach), reach
+    )
+    return torch.where(found & (tracklet >= 0), support.lane[index], none)
+
+
+def _layered(
+    point: Float[Tensor, "m 3"], layer: Int[Tensor, " m"], reach: float
+) -> Float[Tensor, "m 4"]:
+    """Points with a coordinate more, in which the layers lie farther apart than a search reaches."""
+    return torch.cat((point, 2 * reach * layer[:, None].to(point)), dim=1)
+
+
+def _nearest(
+    samples: Float[Tensor, "s k"], point: Float[Tensor, "m k"], reach: float
+) -> tuple[Int[Tensor, " m"], Bool[Tensor, " m"]]:
+    """The nearest sample of each point, and whether it is within reach."""
+    distance, index = KDTree(samples.cpu().numpy()).query(
+        point.cpu().numpy(), distance_upper_bound=reach
+    )
+    found = torch.as_tensor(distance, device=point.device) < reach
+    index = torch.as_tensor(index, device=point.device)
+    return index.clamp_max(len(samples) - 1), found
 
 
 def sample_parameters(

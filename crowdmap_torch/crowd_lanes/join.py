@@ -37,7 +37,7 @@ from crowdmap_torch.crowd_lanes.splines import (
     nearest_row,
     select_curves,
 )
-from crowdmap_torch.crowd_lanes.table import lanes_table
+from crowdmap_torch.crowd_lanes.table import LaneSupport, lanes_table
 from crowdmap_torch.crowd_lanes.trace import (
     TraceConfig,
     Traced,
@@ -117,6 +117,8 @@ class JoinedLanes:
     lanes: Lanes
     piece_lane: Int[Tensor, " n"]
     """Lane on which the most of each input piece lies; -1 for none."""
+    support: LaneSupport
+    """Which lane each place of the pieces is of."""
     report: LaneJoinReport
 
 
@@ -155,6 +157,9 @@ def join_lanes(lanes: Lanes, positioning: PositioningNoise, config: LaneJoinConf
     return JoinedLanes(
         lanes=table,
         piece_lane=group_mode(matched.curve, kept.line.weight, kept.piece, len(lanes)),
+        support=LaneSupport(
+            kept.line.point, kept.line.owner, lanes.tracklet[kept.piece], matched.curve
+        ),
         report=LaneJoinReport(
             samples=len(all_samples),
             stray_samples=int(stray.sum()),
@@ -338,6 +343,7 @@ def _nothing(lanes: Lanes, samples: LaneSamples) -> JoinedLanes:
     return JoinedLanes(
         lanes=lanes.select(row),
         piece_lane=torch.full_like(lanes.journey, -1),
+        support=LaneSupport(samples.line.point[:0], row, row, row),
         report=LaneJoinReport(0, 0, 0, 0, 0.0, 0.0, 0.0),
     )
 

@@ -2,15 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, group_range, group_sum
+from crowdmap_torch.crowd_lanes.line_samples import points_along
 from crowdmap_torch.crowd_lanes.samples import LaneSamples
 from crowdmap_torch.crowd_lanes.splines import Curves, Match
 from crowdmap_torch.geometry import spline_basis
-from crowdmap_torch.tables import ControlPoints, Lanes
+from crowdmap_torch.tables import ControlPoints, Lanes, Rows
+
+
+@dataclass(frozen=True)
+class LaneSupport(Rows):
+    """Samples of the journeys' lane pieces, and the lane of the map that clustering found them to be of."""
+
+    point_world: Float[Tensor, "s 3"]
+    """Of the piece without its journey's bias [m]."""
+    journey: Int[Tensor, " s"]
+    tracklet: Int[Tensor, " s"]
+    """Of that journey."""
+    lane: Int[Tensor, " s"]
+    """-1 where the sample is of no lane of the map."""
+
+
+def support_of_pieces(
+    lanes: Lanes, lane_of_piece: Int[Tensor, " n"], spacing: float
+) -> LaneSupport:
+    """Samples of whole pieces at most `spacing` [m] apart, each piece being of one lane or none."""
+    packed = lanes.select(torch.arange(len(lanes), device=lanes.journey.device))
+    along = points_along(packed.control.point_world, packed.control_count, spacing)
+    piece = along.spline
+    return LaneSupport(
+        along.point, lanes.journey[piece], lanes.tracklet[piece], lane_of_piece[piece]
+    )
 
 
 def lanes_table(

@@ -15,12 +15,22 @@ from crowdmap_torch.adjustment.lane_matching import (
     follow,
     nearest_lanes,
     sample_parameters,
+    supported_lanes,
 )
 from crowdmap_torch.adjustment.lenses import seen_points
 from crowdmap_torch.adjustment.observations import LanePointObservations
+from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import camera, se3, spline_basis
 from crowdmap_torch.geometry.camera import Camera
-from crowdmap_torch.tables import Journey, LaneDetections, LanePoints, Lanes, Rig, RoadEstimate
+from crowdmap_torch.tables import (
+    Journey,
+    LaneDetections,
+    LanePoints,
+    Lanes,
+    Rig,
+    RoadEstimate,
+    Tracklets,
+)
 
 HEIGHT = 1.5
 K = torch.tensor([[900.0, 0, 639.5], [0, 900, 399.5], [0, 0, 1]], dtype=torch.float64)
@@ -75,6 +85,42 @@ def test_nothing_is_near_where_there_are_no_lanes_or_no_points(lanes: Lanes):
     point = torch.zeros(3, 3, dtype=torch.float64)
     assert nearest_lanes(point, Builder().lanes([]), gate=0.9)[0].tolist() == [-1, -1, -1]
     assert len(nearest_lanes(point[:0], lanes, gate=0.9)[0]) == 0
+
+
+def test_lanes_that_are_asked_for_are_taken_though_others_are_nearer(lanes: Lanes):
+    points = torch.tensor([[10.0, 1.6, 0], [10, 1.6, 0], [10, 1.6, 0], [10, 1.6, 0]]).double()
+    asked = torch.tensor([1, 0, 2, -1])
+    lane, t = nearest_lanes(points, lanes, gate=2.0, of=asked)
+    assert lane.tolist() == [1, 0, -1, -1]
+    at = spline_basis.evaluate_flat(
+        lanes.control.point_world, lanes.control_count, t[:2], asked[:2]
+    )
+    assert ((at[:, 0] - 10).abs() < 0.3).all()
+
+
+def test_a_point_keeps_the_lane_of_its_own_tracklet() -> None:
+    """Two markers 20 cm apart, seen by two journeys: nearer to the other one is not of the other one."""
+    x = torch.arange(0, 20, 2).double()
+    line = torch.stack((x, torch.zeros_like(x), torch.zeros_like(x)), dim=-1)
+    left = line + torch.tensor([0.0, 0.2, 0.0])
+    support = LaneSupport(
+        point_world=torch.cat((line, left, left)),
+        journey=torch.tensor([0, 0, 1]).repeat_interleave(len(x)),
+        tracklet=torch.tensor([0, 1, 0]).repeat_interleave(len(x)),
+        lane=torch.tensor([4, 7, 7]).repeat_interleave(len(x)),
+    )
+    tracklets = [Tracklets(torch.tensor([1, 0, -1]), 2), Tracklets(torch.tensor([0]), 1)]
+    px = torch.full((5, 2), 600.0).double()
+    points = replace(
+        observe(px), journey=torch.tensor([0, 0, 0, 1, 1]), detection=torch.tensor([0, 1, 2, 0, 0])
+    )
+    ground = torch.tensor([[5.0, 0.02, 0], [5, 0.18, 0], [5, 0, 0], [5, 0, 0], [30, 0.2, 0]])
+    found = supported_lanes(ground.double(), points, tracklets, support, reach=3.0)
+    assert found.tolist() == [7, 4, -1, 7, -1]
+    nothing = support[torch.zeros(0, dtype=torch.int64)]
+    assert (
+        supported_lanes(ground.double(), points, tracklets, nothing, reach=3.0).tolist() == [-1] * 5
+    )
 
 
 def test_samples_reach_from_end_to_end_without_gaps(lanes: Lanes):

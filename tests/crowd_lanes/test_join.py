@@ -175,6 +175,23 @@ def test_pieces_name_the_true_marker(world: lane_world.LaneWorld, joined: Joined
     assert (of_lane[lane[used]] == world.marker_of_piece[used]).mean() > 0.96
 
 
+def test_samples_name_the_lane_that_they_lie_on(
+    world: lane_world.LaneWorld, joined: JoinedLanes
+) -> None:
+    support, lanes = joined.support, joined.lanes
+    used = support.lane >= 0
+    assert used.double().mean() > 0.9
+    point, _, owner = spline_length.sample_flat(lanes.control.point_world, lanes.control_count, 0.5)
+    for lane in support.lane[used].unique().tolist():
+        near = KDTree(point[owner == lane, :2].numpy())
+        distance = near.query(support.point_world[support.lane == lane, :2].numpy())[0]
+        # Journeys' own offsets are still in.
+        assert np.median(distance) < 0.5
+    of = {(int(j), int(t)) for j, t in zip(world.lanes.journey, world.lanes.tracklet, strict=True)}
+    found = zip(support.journey.tolist(), support.tracklet.tolist(), strict=True)
+    assert set(found) <= of
+
+
 def test_nothing_depends_on_row_order(world: lane_world.LaneWorld, joined: JoinedLanes) -> None:
     order = torch.randperm(len(world.lanes), generator=torch.Generator().manual_seed(1))
     again = join_lanes(world.lanes.select(order), NOISE, CONFIG)
