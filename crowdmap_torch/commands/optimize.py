@@ -34,7 +34,7 @@ from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.processes.interrupts import keeping
-from crowdmap_torch.processes.threads import one_core_each
+from crowdmap_torch.processes.threads import one_core_each, repeatable
 from crowdmap_torch.ranges import Count, Workers, argument
 from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
@@ -268,6 +268,8 @@ def _device(name: str) -> torch.device:
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(f"--device {name}: no CUDA device is there; use --device cpu")
     try:
-        return torch.device(name)
+        device = torch.device(name)
     except RuntimeError:
         raise ValueError(f"--device {name}: expected cpu or cuda") from None
+    repeatable(device)
+    return device

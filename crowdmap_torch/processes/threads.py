@@ -7,6 +7,7 @@ operation on one core, and whoever asked for the pieces adds them up, in order: 
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -53,6 +54,18 @@ def one_core_each() -> Iterator[None]:
         _kept.cores = None
         # After the libraries' own limits: torch's OpenMP is one of them.
         torch.set_num_threads(cores)
+
+
+def repeatable(device: torch.device) -> None:
+    """From now on sums on a GPU have the same bits every time: they are taken over sorted rows, not by atomic additions.
+
+    To be called before anything runs there. On a CPU they have anyway.
+    """
+    if device.type == "cuda":
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        # Memory that is not written yet is not read either.
+        setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010
 
 
 def in_order(function: Callable[[T], R], items: Sequence[T], device: torch.device) -> Iterator[R]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from crowdmap_torch.processes.threads import in_order, one_core_each
+from crowdmap_torch.processes.threads import in_order, one_core_each, repeatable
 
 CPU = torch.device("cpu")
 
@@ -66,6 +67,19 @@ def test_threads_are_as_before_after_an_error(threads: int):
     with pytest.raises(ValueError, match="on the way"), one_core_each():
         raise ValueError("on the way")
     assert torch.get_num_threads() == threads
+
+
+def test_a_gpu_is_told_to_take_sums_in_one_order(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
+    before = torch.are_deterministic_algorithms_enabled()
+    try:
+        repeatable(CPU)
+        assert torch.are_deterministic_algorithms_enabled() == before
+        repeatable(torch.device("cuda:0"))
+        assert torch.are_deterministic_algorithms_enabled()
+        assert os.environ["CUBLAS_WORKSPACE_CONFIG"] == ":4096:8"
+    finally:
+        torch.use_deterministic_algorithms(before)
 
 
 def test_pieces_within_pieces_are_not_waited_for_in_vain(threads: int):
