@@ -26,9 +26,9 @@ demo: $(STAMP)  ## simulate a street, map it, compare the map with its survey; e
 	$(BIN)/crowdmap simulate $(DEMO)/street --world street --journeys 8 --seed 1
 	$(BIN)/crowdmap optimize $(DEMO)/street --out $(DEMO)/run --overwrite
 
-# Two cores: half of the seeds each. What fails stays in soak-failures/.
-soak: $(STAMP)  ## ten thousand destroyed data sets: no traceback, no hang, nothing lost without a word
-	$(BIN)/python scripts/soak.py --mutants $(MUTANTS) --processes 2
+# Two cores: half of the mutants each. What fails stays in soak-failures/.
+soak: $(STAMP)  ## ten thousand destroyed inputs: no traceback, no hang, nothing lost without a word
+	$(BIN)/python scripts/soak.py mutants --count $(MUTANTS) --processes 2
 
 # Each core has a process of its own, and files stay whole: their fixtures are made once. Annotations of shapes are checked.
 TESTS := CROWDMAP_CHECK_SHAPES=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist loadfile

@@ -9,6 +9,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -149,6 +150,7 @@ def as_dict(config: MapperConfig) -> dict[str, Any]:
     return json.loads(json.dumps(asdict(config)))
 
 
+@lru_cache(maxsize=4)
 def dump(config: MapperConfig) -> str:
     """The configuration as YAML, defaults filled in."""
     return yaml.safe_dump(as_dict(config), sort_keys=False)

@@ -1,4 +1,4 @@
-"""Destroys data sets at random and maps what is left: the code is `crowdmap_torch/soak/soak.py`."""
+"""What the mapper stands: the code is `crowdmap_torch/soak/soak.py`."""
 
 import sys
 

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,48 +34,94 @@ class Outcome:
     err: str
 
 
-def run_apart(main: Callable[[], int], folder: Path, *, seconds: float = SECONDS) -> Outcome:
-    """Runs `main` in a forked process, its working folder and its output in `folder`; killed when its time is up."""
-    cwd, out, err = folder / "cwd", folder / "out.txt", folder / "err.txt"
-    cwd.mkdir(exist_ok=True)
-    begun = time.monotonic()
-    child = os.fork()
-    if child == 0:
-        _become(main, cwd, out, err)
-    ended, status, usage = 0, 0, None
-    pause = 0.002
-    while not ended:
-        ended, status, usage = os.wait4(child, os.WNOHANG)
-        if not ended and time.monotonic() - begun > seconds:
-            os.kill(child, signal.SIGKILL)
-            ended, status, usage = os.wait4(child, 0)
-        if not ended:
+class Child:
+    """A forked process that runs `main`, its working folder and its output in `folder`, in a group of its own."""
+
+    def __init__(self, main: Callable[[], int], folder: Path) -> None:
+        self._folder = folder
+        (folder / "cwd").mkdir(exist_ok=True)
+        self._begun = time.monotonic()
+        self.pid = os.fork()
+        if self.pid == 0:
+            _become(main, folder)
+        self._outcome: Outcome | None = None
+
+    def has_ended(self) -> bool:
+        """Whether it has; asking costs next to nothing."""
+        if self._outcome is None:
+            ended, status, usage = os.wait4(self.pid, os.WNOHANG)
+            if ended:
+                self._outcome = Outcome(
+                    code=os.waitstatus_to_exitcode(status),
+                    seconds=time.monotonic() - self._begun,
+                    resident_bytes=usage.ru_maxrss * 1024,
+                    out=(self._folder / "out.txt").read_text("utf-8", "replace"),
+                    err=(self._folder / "err.txt").read_text("utf-8", "replace"),
+                )
+        return self._outcome is not None
+
+    def outcome(self, *, seconds: float = SECONDS) -> Outcome:
+        """Waits for its end; it is killed so many seconds after its beginning."""
+        pause = 0.002
+        while not self.has_ended():
+            if time.monotonic() - self._begun > seconds:
+                os.kill(self.pid, signal.SIGKILL)
             time.sleep(pause)
             pause = min(2 * pause, 0.05)
-    assert usage is not None
-    return Outcome(
-        code=os.waitstatus_to_exitcode(status),
-        seconds=time.monotonic() - begun,
-        resident_bytes=usage.ru_maxrss * 1024,
-        out=out.read_text("utf-8", "replace"),
-        err=err.read_text("utf-8", "replace"),
-    )
+        assert self._outcome is not None
+        return self._outcome
 
 
-def _become(main: Callable[[], int], cwd: Path, out: Path, err: Path) -> None:
+def run_apart(main: Callable[[], int], folder: Path, *, seconds: float = SECONDS) -> Outcome:
+    """What came of `main` in a `Child`."""
+    return Child(main, folder).outcome(seconds=seconds)
+
+
+def children(process: int) -> list[int]:
+    """The processes that a process has begun; Linux alone tells."""
+    listed = Path(f"/proc/{process}/task").glob("*/children")
+    return [int(child) for task in listed for child in task.read_text().split()]
+
+
+def is_there(process: int) -> bool:
+    """Whether a process runs; one that has ended and was not asked for its code does not."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return not Path("/proc/self/stat").exists()
+
+
+def ends(process: int, within_s: float) -> bool:
+    """Whether a process that need not be a child ends in time."""
+    until = time.monotonic() + within_s
+    while is_there(process):
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def _become(main: Callable[[], int], folder: Path) -> None:
     """What the child does; it never returns."""
     code = 1
     try:
-        os.chdir(cwd)
-        for path, number in ((out, 1), (err, 2)):
-            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.setpgid(0, 0)
+        os.chdir(folder / "cwd")
+        for name, number in (("out.txt", 1), ("err.txt", 2)):
+            file = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(file, number)
         # Whoever began this process may have put something else in their place.
         sys.stdout, sys.stderr = (os.fdopen(n, "w", closefd=False) for n in (1, 2))
-        os.environ["TMPDIR"] = str(cwd)
+        os.environ |= {"TMPDIR": str(folder / "cwd"), "HOME": str(folder / "cwd")}
         most = _mapped_bytes() + _HEADROOM_BYTES
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        # What the parent was warned of already is said once more.
+        warnings.simplefilter("default", RuntimeWarning)
         code = main()
     except SystemExit as ended:
         code = ended.code if isinstance(ended.code, int) else 1

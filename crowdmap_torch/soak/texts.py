@@ -49,7 +49,7 @@ def mutate_document(path: Path, rng: np.random.Generator) -> str:
     try:
         text = path.read_text("utf-8")
         content = json.loads(text) if is_json else yaml.safe_load(text)
-    except (ValueError, yaml.YAMLError):
+    except (ValueError, RecursionError, yaml.YAMLError):
         return mutate_text(path, rng)
     done = _change(content, rng)
     text = json.dumps(content) if is_json else yaml.safe_dump(content)

@@ -1,4 +1,4 @@
-"""What has to hold after a run on a destroyed data set, whatever was destroyed."""
+"""What has to hold after a command on inputs that were destroyed, whatever was destroyed."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,25 +18,73 @@ import pyarrow.parquet as pq
 from crowdmap_torch.soak.child import RESIDENT_BYTES, SECONDS, Outcome
 
 EXIT_CODES = (0, 1, 2, 3)
-SAID = re.compile(
-    r"(crowdmap optimize: |set aside |looks wrong: |resumed: |warning: )\S"
-    r"|(single journeys|clusters|bundle adjustment|covariances|errors and report)"
-)
-"""How a line on stderr begins."""
+WRITTEN = (0, 3)
+"""Exit codes with which something was written."""
+PROGRESS = re.compile(r"single journeys|clusters|bundle adjustment|covariances|errors and report")
+"""How a line on stderr begins that says how far a run is."""
+SAID = re.compile(r"(set aside |looks wrong: |resuming: |warning: )\S")
+"""How others begin that are no errors."""
 FARTHEST_M = 1e6
+PLACES = {"inputs", "run", "figures.json", "done.json", "cwd", "out.txt", "err.txt"}
+"""What may stand beside the inputs once a command has ended."""
 
 
-def problems(data: Path, run: Path, outcome: Outcome, before: str) -> list[str]:
-    """What is broken of what has to hold; `before` is the data set's `digest` before the run."""
-    found = [*_of_outcome(outcome)]
-    if digest(data) != before:
-        found.append("the data set was changed")
-    if stray := sorted(p.name for p in (run.parent / "cwd").iterdir()):
-        found.append(f"written beside RUN: {stray[:5]}")
-    if outcome.code == 0:
-        found += _of_map(run)
-        found += _of_journeys(data, run, outcome)
-    return found
+def problems_of_outcome(
+    outcome: Outcome, command: str, *, codes: Collection[int] = EXIT_CODES
+) -> Iterator[str]:
+    """What is broken of how a subcommand of `crowdmap` ended, and of what it said."""
+    if outcome.code not in codes:
+        yield f"exit code {outcome.code}"
+    if outcome.seconds > SECONDS:
+        yield f"took {outcome.seconds:.0f} s"
+    if outcome.resident_bytes > RESIDENT_BYTES:
+        yield f"took {outcome.resident_bytes / 2**20:.0f} MB"
+    reason = f"crowdmap {command}: "
+    lines = [line.strip() for line in re.split(r"[\r\n]+", outcome.err) if line.strip()]
+    if "Traceback" in outcome.err or "Traceback" in outcome.out:
+        yield f"a traceback: {(lines or [''])[-1][:200]}"
+    elif unknown := [x for x in lines if not (_is_known(x) or x.startswith(reason))]:
+        yield f"an unknown line on stderr: {unknown[0][:200]!r}"
+    begins = "looks wrong: " if outcome.code == 3 else reason
+    told = sum(line.startswith(begins) for line in lines)
+    expected = {0: (0, 0), 3: (1, len(lines))}
+    least, most = expected.get(outcome.code, (1, 1))
+    if not least <= told <= most:
+        yield f"exit code {outcome.code} with {told} lines of reason"
+
+
+def _is_known(line: str) -> bool:
+    return bool(SAID.match(line) or PROGRESS.match(line))
+
+
+def problems_of_place(place: Path, before: str) -> Iterator[str]:
+    """Whether anything but outputs was written; `before` is the `digest` of the inputs before the command."""
+    if digest(place / "inputs") != before:
+        yield "the inputs were changed"
+    stray = {p.name for p in place.iterdir()} - PLACES
+    stray |= {p.name for p in (place / "cwd").iterdir()}
+    if stray:
+        yield f"written beside the outputs: {sorted(stray)[:5]}"
+
+
+def problems_of_run(data: Path, run: Path, outcome: Outcome) -> Iterator[str]:
+    """What is broken of the folder of a run that ended well."""
+    yield from _of_map(run)
+    yield from _of_journeys(data, run, outcome)
+
+
+def problems_of_figures(path: Path, hd_map: Path, survey: Path) -> Iterator[str]:
+    """What is broken of the figures of a map, where `crowdmap evaluate` ended well."""
+    figures = json.loads(path.read_text(), parse_constant=lambda name: {"is": name})
+    if wrong := [name for name, value in _numbers(figures) if not np.isfinite(value)]:
+        yield f"figures: {wrong[:5]} are not finite"
+    signs, control = figures["signs"], figures["control_signs"]
+    counted = {"true_signs": (signs["true_signs"] + control, survey)}
+    if not control:
+        counted["map_signs"] = (signs["map_signs"], hd_map)
+    for name, (found, folder) in counted.items():
+        if found != (rows := pq.read_metadata(folder / "signs.parquet").num_rows):
+            yield f"figures: {name} counts {found} of {rows}"
 
 
 def digest(folder: Path) -> str:
@@ -51,25 +100,6 @@ def digest(folder: Path) -> str:
             elif os.path.isfile(path):
                 total.update(Path(path).read_bytes())
     return total.hexdigest()
-
-
-def _of_outcome(outcome: Outcome) -> Iterator[str]:
-    if outcome.code not in EXIT_CODES:
-        yield f"exit code {outcome.code}"
-    if outcome.seconds > SECONDS:
-        yield f"took {outcome.seconds:.0f} s"
-    if outcome.resident_bytes > RESIDENT_BYTES:
-        yield f"took {outcome.resident_bytes / 2**20:.0f} MB"
-    if "Traceback" in outcome.err or "Traceback" in outcome.out:
-        yield f"a traceback: {outcome.err.strip().splitlines()[-1][:200]}"
-    else:
-        for line in re.split(r"[\r\n]+", outcome.err):
-            if line.strip() and not SAID.match(line.strip()):
-                yield f"an unknown line on stderr: {line.strip()[:200]!r}"
-                break
-    errors = [x for x in outcome.err.splitlines() if x.startswith("crowdmap optimize: ")]
-    if outcome.code and len(errors) != 1:
-        yield f"exit code {outcome.code} with {len(errors)} lines of reason"
 
 
 def _of_map(run: Path) -> Iterator[str]:
@@ -114,3 +144,15 @@ def _flat(column: pa.ChunkedArray) -> np.ndarray:
             [c.flatten() for c in column.chunks] or [], column.type.value_type
         )
     return column.to_numpy()
+
+
+def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
+    """Every number of nested content, and those that are none, by their place."""
+    if isinstance(content, dict) and set(content) == {"is"}:
+        yield name, np.nan
+    elif isinstance(content, dict | list):
+        items = content.items() if isinstance(content, dict) else enumerate(content)
+        for key, value in items:
+            yield from _numbers(value, f"{name}.{key}" if name else str(key))
+    elif isinstance(content, int | float):
+        yield name, content

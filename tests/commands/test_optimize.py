@@ -22,7 +22,7 @@ import pytest
 import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from worlds.programs import PATIENCE_S, begin, children, ends
+from worlds.programs import PATIENCE_S, begin
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
@@ -31,6 +31,7 @@ from crowdmap_torch.commands import optimize as optimize_command
 from crowdmap_torch.config import MapperConfig, load_config
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.runs.folder import RunFolder
+from crowdmap_torch.soak.child import children, ends
 from crowdmap_torch.tables import Dataset
 
 LANDMARK = {"n_journeys", "n_observations", "first_seen_ns", "last_seen_ns", "confidence"}
@@ -509,7 +510,7 @@ def test_a_signal_is_one_line_and_leaves_nobody_behind(
         "the same command with --resume goes on"
     )
     assert all(line.startswith(("clusters", "bundle", "single")) for line in progress)
-    assert all(ends(worker) for worker in workers)
+    assert all(ends(worker, PATIENCE_S) for worker in workers)
     assert not (out / "run.lock").exists() and not (out / "map").exists()
 
 

@@ -9,9 +9,10 @@ import signal
 import time
 
 import pytest
-from worlds.programs import PATIENCE_S, begin, ends
+from worlds.programs import PATIENCE_S, begin
 
 from crowdmap_torch.processes.workers import Workers
+from crowdmap_torch.soak.child import ends
 
 BEGIN = """
 import os, sys, time
@@ -34,7 +35,7 @@ def test_every_call_is_done_once_and_by_another_process():
     with Workers(2, os.getpid) as pool:
         assert dict(pool.each(calls)) == {n: n + 1 for n in range(7)}
         (_, process), *_ = pool.each([("who", os.getpid, ())])
-    assert process != os.getpid() and ends(process)
+    assert process != os.getpid() and ends(process, PATIENCE_S)
 
 
 def test_what_a_task_raises_is_raised_here_and_tells_where():
@@ -75,7 +76,7 @@ def test_a_block_that_is_left_leaves_no_worker():
         processes += [made for _, made in pool.each([("who", os.getpid, ())])]
         pool.start(0, ("long", time.sleep, (600,)))
         raise KeyboardInterrupt
-    assert ends(*processes)
+    assert [ends(process, PATIENCE_S) for process in processes] == [True]
 
 
 @pytest.mark.parametrize("killer", [signal.SIGKILL, signal.SIGTERM])
@@ -87,7 +88,7 @@ def test_workers_end_with_the_process_that_began_them(killer: signal.Signals):
     program.send_signal(killer)
     _, said = program.communicate(timeout=PATIENCE_S)
     assert program.returncode == -killer and said == ""
-    assert all(ends(worker) for worker in workers)
+    assert all(ends(worker, PATIENCE_S) for worker in workers)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
