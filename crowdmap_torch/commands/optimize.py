@@ -241,6 +241,8 @@ def _take_up(
 ) -> Found | None:
     """What an interrupted run had finished, said in a line; None if it was not interrupted."""
     if kept.is_finished(folder.map):
+        # It may have been killed while it removed its stages.
+        kept.drop_stages()
         print(f"finished already: {folder.map}")
         return None
     found = kept.found(journeys, device=device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Iterator
@@ -10,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from crowdmap_torch.processes.interrupts import held
+
+_BESIDE = re.compile(r"\..+\.[0-9a-f]{12}\.part")
 
 
 @contextmanager
@@ -47,6 +50,16 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     finally:
         with held():
             shutil.rmtree(beside, ignore_errors=True)
+
+
+def drop_halves(folder: Path) -> None:
+    """Removes what writers that were killed have left half-written in a folder and below; none may be writing there now."""
+    for path in list(folder.rglob("*.part")):
+        if _BESIDE.fullmatch(path.name):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
 
 
 @contextmanager

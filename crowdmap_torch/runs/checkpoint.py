@@ -26,6 +26,7 @@ import torch
 from crowdmap_torch import __version__
 from crowdmap_torch.adjustment.adjust import Standing
 from crowdmap_torch.config import MapperConfig, as_dict
+from crowdmap_torch.io.atomic import drop_halves
 from crowdmap_torch.io.documents import read_json, write_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.stages import read_stage, write_stage
@@ -116,11 +117,16 @@ class Checkpoint:
         self._write(finished=False)
 
     def finish(self) -> None:
-        """Removes the stages; what the run was made of stays."""
+        """Says that the run is finished, and removes the stages; what it was made of stays."""
         self._write(finished=True)
+        self.drop_stages()
+
+    def drop_stages(self) -> None:
+        """Removes the stages of a run that is finished."""
         shutil.rmtree(self.folder / "journeys", ignore_errors=True)
         for name in ("first_map", "start", "step"):
             self._path(name).unlink(missing_ok=True)
+        drop_halves(self.folder)
 
     def found(self, journeys: int, *, device: torch.device) -> Found:
         """All stages that were kept of a run with so many journeys."""

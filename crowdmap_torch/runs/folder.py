@@ -16,7 +16,7 @@ from crowdmap_torch.config import MapperConfig, dump
 from crowdmap_torch.evaluation.evaluate import control_ids_of, evaluate_map, refuse_other_origin
 from crowdmap_torch.evaluation.evidence import read_journey_landmarks
 from crowdmap_torch.evaluation.map_figures import MapFigures
-from crowdmap_torch.io.atomic import atomic_file
+from crowdmap_torch.io.atomic import atomic_file, drop_halves
 from crowdmap_torch.io.documents import plain, read_json, write_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.landmarks import write_lanes, write_signs
@@ -107,9 +107,13 @@ class RunFolder:
         """Begins a run; without `resume` what an interrupted one has left goes."""
         self._is_begun = True
         write_json(self.path / "run.json", {"format": _FORMAT, "version": 1})
-        if not self.resume:
+        if self.resume:
+            # A run that was killed could clear nothing away; its finished stages alone are gone on from.
+            self._drop_result()
+        else:
             shutil.rmtree(self.unfinished, ignore_errors=True)
             shutil.rmtree(self.checkpoint, ignore_errors=True)
+        drop_halves(self.path)
         self.unfinished.mkdir(exist_ok=True)
 
     def kept(self) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from crowdmap_torch.io.atomic import atomic_file, atomic_folder
+from crowdmap_torch.io.atomic import atomic_file, atomic_folder, drop_halves
 
 
 class InterruptedWriteError(Exception):
@@ -99,3 +99,19 @@ def test_a_full_disk_names_the_file_that_it_was_written_to(tmp_path: Path, atomi
     with pytest.raises(OSError, match=r"No space left on device: '.*/map'$"), atomic(path):
         raise OSError(28, "No space left on device")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_writer_left_is_dropped_and_nothing_else(tmp_path: Path) -> None:
+    inside = tmp_path / "inside"
+    with atomic_file(inside / "file") as beside, atomic_folder(inside / "map") as folder:
+        # As they stand at the moment of a kill.
+        beside.touch()
+        names = beside.name, folder.name
+    strangers = [inside / name for name in ("notes.part", ".notes.part", ".file.abc.part")]
+    for path in strangers:
+        path.touch()
+    (inside / names[0]).touch()
+    (inside / names[1]).mkdir()
+    (inside / names[1] / "signs.parquet").touch()
+    drop_halves(tmp_path)
+    assert set(inside.iterdir()) == {inside / "file", inside / "map", *strangers}

@@ -129,6 +129,27 @@ def test_only_a_run_that_goes_on_keeps_its_events_and_checkpoint(tmp_path: Path,
         assert before.items() <= files_of(tmp_path).items()
 
 
+@pytest.mark.parametrize("resume", [False, True])
+def test_what_a_killed_run_left_half_written_is_in_no_result(tmp_path: Path, resume: bool):
+    before = write_older(tmp_path)
+    run = RunFolder(tmp_path, overwrite=not resume, resume=resume)
+    half = ".0123456789ab.part"
+    for path in (
+        *(tmp_path / f".run.json{half}", run.checkpoint / "journeys" / f".00001.pt{half}"),
+        *(run.unfinished / f".map{half}" / "a", run.unfinished / f".metrics.json{half}"),
+        *(run.unfinished / "journeys" / "drive" / f".poses.parquet{half}", run.unfinished / "map"),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    with run.claimed():
+        run.prepare()
+        assert files_of(tmp_path).keys() == before.keys() | {"run.lock"}
+        with run.publishing():
+            write_newer(run, NEWER)
+    assert files_of(tmp_path).keys() == {*NEWER, *STRANGE}
+    assert not [p for p in run.checkpoint.rglob("*") if p.is_file()]
+
+
 def test_a_new_result_takes_the_place_of_all_of_the_older_one(tmp_path: Path):
     write_older(tmp_path)
     run = RunFolder(tmp_path, overwrite=True)
