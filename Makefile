@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 MUTANTS := 10000
+KILLS := 60
+SIGNALS := 10
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test soak test-coverage lint format
@@ -27,8 +29,10 @@ demo: $(STAMP)  ## simulate a street, map it, compare the map with its survey; e
 	$(BIN)/crowdmap optimize $(DEMO)/street --out $(DEMO)/run --overwrite
 
 # Two cores: half of the mutants each. What fails stays in soak-failures/.
-soak: $(STAMP)  ## ten thousand destroyed inputs: no traceback, no hang, nothing lost without a word
+soak: $(STAMP)  ## ten thousand destroyed inputs, sixty kills, twenty signals: no traceback, no hang, nothing lost without a word
 	$(BIN)/python scripts/soak.py mutants --count $(MUTANTS) --processes 2
+	$(BIN)/python scripts/soak.py kills --count $(KILLS)
+	$(BIN)/python scripts/soak.py signals --count $(SIGNALS)
 
 # Each core has a process of its own, and files stay whole: their fixtures are made once. Annotations of shapes are checked.
 TESTS := CROWDMAP_CHECK_SHAPES=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --dist loadfile

@@ -22,6 +22,7 @@ from crowdmap_torch.soak.verdict import (
     WRITTEN,
     digest,
     problems_of_figures,
+    problems_of_limits,
     problems_of_outcome,
     problems_of_place,
     problems_of_run,
@@ -86,7 +87,8 @@ def attempt(good: Good, place: Path, number: int, seed: int, *, mapped: float = 
         return Verdict(number, kind, [], apart, [f"the mutation failed: {apart.err[-300:]}"])
     mutations, before = json.loads(done.read_text())
     outcome = run_apart(run, place)
-    problems = [*problems_of_outcome(outcome, trial.command[0]), *problems_of_place(place, before)]
+    problems = [*problems_of_outcome(outcome, trial.command[0]), *problems_of_limits(outcome)]
+    problems += problems_of_place(place, before)
     if outcome.code in WRITTEN:
         problems += trial.judge(outcome)
     return Verdict(number, kind, mutations, outcome, problems)

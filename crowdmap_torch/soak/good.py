@@ -65,22 +65,16 @@ def map_here(data: Path, run: Path, config: Path) -> None:
 
 
 def write_street(
-    folder: Path,
-    *,
-    length_m: float,
-    frame_rate_hz: float,
-    seed: int,
-    camera: str = "pinhole",
-    journeys: int = 3,
+    folder: Path, *, length_m: float, frame_rate_hz: float, seed: int, camera: str = "pinhole"
 ) -> None:
-    """Some drives of some metres of a street, with a survey and its truth."""
+    """Three drives of some metres of a street, with a survey and its truth."""
     street = WORLD_PRESETS["street"]
     signs = replace(street.signs, posts_per_km=60.0)
     config = SimulationConfig(
         world=replace(street, length_m=length_m, lights_per_km=0.0, signs=signs),
         vehicle=VehicleConfig(frame_rate_hz=frame_rate_hz),
         rig=RigConfig(camera=camera),
-        journeys=journeys,
+        journeys=3,
         seed=seed,
     )
     write_dataset(config, folder)

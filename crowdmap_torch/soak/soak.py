@@ -11,7 +11,11 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 from crowdmap_torch.commands.subcommands import OneLineParser, add_subcommands
 
-STUDIES = {"mutants": "destroy inputs at random, and run commands on what is left"}
+STUDIES = {
+    "mutants": "destroy inputs at random, and run commands on what is left",
+    "kills": "kill runs at random instants, and resume them",
+    "signals": "interrupt runs at random instants, and resume them",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

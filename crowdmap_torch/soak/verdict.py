@@ -35,10 +35,6 @@ def problems_of_outcome(
     """What is broken of how a subcommand of `crowdmap` ended, and of what it said."""
     if outcome.code not in codes:
         yield f"exit code {outcome.code}"
-    if outcome.seconds > SECONDS:
-        yield f"took {outcome.seconds:.0f} s"
-    if outcome.resident_bytes > RESIDENT_BYTES:
-        yield f"took {outcome.resident_bytes / 2**20:.0f} MB"
     reason = f"crowdmap {command}: "
     lines = [line.strip() for line in re.split(r"[\r\n]+", outcome.err) if line.strip()]
     if "Traceback" in outcome.err or "Traceback" in outcome.out:
@@ -51,6 +47,14 @@ def problems_of_outcome(
     least, most = expected.get(outcome.code, (1, 1))
     if not least <= told <= most:
         yield f"exit code {outcome.code} with {told} lines of reason"
+
+
+def problems_of_limits(outcome: Outcome) -> Iterator[str]:
+    """Whether a command took too long, or too much memory."""
+    if outcome.seconds > SECONDS:
+        yield f"took {outcome.seconds:.0f} s"
+    if outcome.resident_bytes > RESIDENT_BYTES:
+        yield f"took {outcome.resident_bytes / 2**20:.0f} MB"
 
 
 def _is_known(line: str) -> bool:

@@ -15,6 +15,7 @@ from crowdmap_torch.soak.child import Outcome, run_apart
 from crowdmap_torch.soak.verdict import (
     digest,
     problems_of_figures,
+    problems_of_limits,
     problems_of_outcome,
     problems_of_place,
 )
@@ -28,7 +29,7 @@ def unlimited(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def ended(main: Callable[[], int], place: Path, **limits: float) -> list[str]:
     outcome = run_apart(main, place, **limits)
-    return list(problems_of_outcome(outcome, "optimize"))
+    return [*problems_of_outcome(outcome, "optimize"), *problems_of_limits(outcome)]
 
 
 def refuses() -> int:

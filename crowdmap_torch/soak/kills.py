@@ -1,0 +1,21 @@
+"""Kills runs at random instants, and resumes them: no workers are left, nothing is repeated, the bits are the same."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+
+from crowdmap_torch.soak.interrupted import add_options, cuts, interrupt, report
+
+_SIGNALS = (signal.SIGKILL,)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What `soak kills` takes."""
+    add_options(parser, count=60)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Cuts and resumes all runs, prints what fails and a table; 0 if everything held."""
+    chosen = cuts(_SIGNALS, options.count, options.stages, seed=options.seed)
+    return report(interrupt(chosen, options.keep.resolve()))
