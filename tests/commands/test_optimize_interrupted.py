@@ -1,0 +1,363 @@
+"""Runs that something stops: what is left of them, what a reader of the older result sees, and how they go on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from worlds.drives import write_tiny
+from worlds.programs import PATIENCE_S, begin
+from worlds.runs import Said, journeys_of
+
+from crowdmap_torch import mapper
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.cli import main
+from crowdmap_torch.commands import optimize as optimize_command
+from crowdmap_torch.config import load_config
+from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.runs.folder import RunFolder
+from crowdmap_torch.soak.child import children, ends
+from crowdmap_torch.soak.interrupted import differences
+
+ROUGH = """\
+adjust: {lm: {max_iterations: 6}, covariance_samples: 4}
+sign_triangulation: {fit: {rounds: 1, lm: {max_iterations: 6}, coarse_lm: {max_iterations: 3}}}
+crowd: {rounds: 1}
+"""
+"""It is not the map that is judged here."""
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three drives that are mapped in a second."""
+    return write_tiny(tmp_path_factory.mktemp("small") / "dataset", frame_rate_hz=3.0, length_m=60)
+
+
+@pytest.fixture(scope="module")
+def rough(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A configuration that takes few steps."""
+    path = tmp_path_factory.mktemp("config") / "rough.yaml"
+    path.write_text(ROUGH)
+    return path
+
+
+@pytest.fixture
+def optimize(
+    optimize: Callable[..., Said], patched: pytest.MonkeyPatch, rough: Path
+) -> Callable[..., Said]:
+    """The same with that configuration, unless another is named."""
+    return lambda dataset, out, *more: optimize(dataset, out, "--config", str(rough), *more)
+
+
+@pytest.fixture(scope="module")
+def maps(small: Path, rough: Path) -> tuple[mapper.JourneyMap, ...]:
+    """What each journey shows by itself."""
+    return mapper.map_journeys(load_dataset(small).journeys, load_config(rough))
+
+
+@pytest.fixture(scope="module")
+def patched(maps: tuple[mapper.JourneyMap, ...]) -> Iterator[pytest.MonkeyPatch]:
+    """Each journey's own map is in memory, and no report is drawn: what follows and precedes them is the tests'."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mapper, "map_journey", lambda journey, number, config: maps[number])
+        patch.setattr(optimize_command, "write_report", lambda path, record: path.touch())
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def run(
+    patched: pytest.MonkeyPatch, small: Path, rough: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A finished run that nothing stopped."""
+    out = tmp_path_factory.mktemp("run") / "run"
+    options = ("--out", str(out), "--config", str(rough), "--workers", "1")
+    assert main(["optimize", str(small), *options]) == 0
+    return out
+
+
+@pytest.fixture
+def copy(small: Path, tmp_path: Path) -> Path:
+    """The dataset, to be spoilt."""
+    return Path(shutil.copytree(small, tmp_path / "dataset"))
+
+
+# Runs that exist.
+
+
+def test_a_run_that_exists_is_refused_and_left_alone(optimize, run: Path, small: Path):
+    before = (run / "map" / "map.json").read_bytes()
+    said = optimize(small, run)
+    assert said.code == 2 and "--overwrite" in said.err and said.err.count("\n") == 1
+    assert (run / "map" / "map.json").read_bytes() == before
+
+
+class Interruption(Exception):
+    """What stops a run in the middle."""
+
+
+class Cuts:
+    """Counts the calls of the stages, and ends a run before one of them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.calls: Counter[str] = Counter()
+        self.cut: tuple[str, int] | None = None
+        for place, name in (
+            (mapper, "map_journey"),
+            (mapper, "first_map"),
+            (adjust, "adjust_step"),
+            (mapper, "finish_map"),
+            (optimize_command, "metrics_of"),
+        ):
+            monkeypatch.setattr(place, name, partial(self._call, name, getattr(place, name)))
+
+    def _call(self, name: str, stage: Callable, *arguments, **options):
+        if self.cut == (name, self.calls[name]):
+            raise Interruption
+        self.calls[name] += 1
+        return stage(*arguments, **options)
+
+
+@pytest.fixture
+def cuts(patched: pytest.MonkeyPatch, monkeypatch: pytest.MonkeyPatch) -> Cuts:
+    return Cuts(monkeypatch)
+
+
+def same_map(one: Path, other: Path) -> bool:
+    """Whether two runs are the same to the last bit, but for their times."""
+    return not differences(one, other)
+
+
+def test_a_run_cut_again_and_again_repeats_nothing_and_ends_with_the_same_bits(
+    optimize, cuts: Cuts, small: Path, tmp_path: Path, run: Path
+):
+    out, steps = tmp_path / "run", len(json.loads((run / "metrics.json").read_text())["costs"])
+    for cut, found in (
+        (("map_journey", 1), None),
+        (("first_map", 0), "1 of 3 journeys"),
+        (("adjust_step", 0), "3 of 3 journeys"),
+        (("adjust_step", 2), "3 of 3 journeys, clusters and biases"),
+        (("adjust_step", steps - 1), "3 of 3 journeys, clusters and biases, step 2"),
+        (("finish_map", 0), f"3 of 3 journeys, clusters and biases, step {steps - 1}"),
+        # The map is there, but not the run.
+        (("metrics_of", 0), f"3 of 3 journeys, clusters and biases, step {steps}"),
+        (None, f"3 of 3 journeys, clusters and biases, step {steps}"),
+    ):
+        cuts.cut = cut
+        options = () if found is None else ("--resume",)
+        if cut is not None:
+            with pytest.raises(Interruption):
+                optimize(small, out, *options)
+            assert (out / "checkpoint" / "inputs.json").exists()
+            continue
+        said = optimize(small, out, *options)
+        assert said.code == 0 and f"resuming: {found}\n" in said.err
+    assert cuts.calls == {
+        **{"map_journey": 3, "first_map": 1, "adjust_step": steps},
+        # Begun again by the last one, which did not know that it was finished.
+        **{"finish_map": 2, "metrics_of": 1},
+    }
+    assert same_map(out, run)
+    resumed, whole = (json.loads((r / "metrics.json").read_text()) for r in (out, run))
+    for name in ("costs", "outcome", "counts", "journeys", "survey"):
+        assert resumed[name] == whole[name]
+    # What is left is small, and says that there is nothing more to do; also where the end was a kill amid clearing away.
+    assert [p.name for p in (out / "checkpoint").rglob("*")] == ["inputs.json"]
+    (out / "checkpoint" / "step.pt").touch()
+    said = optimize(small, out, "--resume")
+    assert said.code == 0 and said.out == f"finished already: {out / 'map'}\n"
+    assert [p.name for p in (out / "checkpoint").rglob("*")] == ["inputs.json"]
+
+
+def test_a_run_does_not_go_on_with_something_else(
+    optimize, cuts: Cuts, copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    out, other = tmp_path / "run", tmp_path / "other.yaml"
+    cuts.cut = ("adjust_step", 1)
+    with pytest.raises(Interruption):
+        optimize(copy, out)
+    before, cuts.cut = dict(cuts.calls), None
+    capsys.readouterr()
+    files = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+
+    other.write_text(ROUGH.replace("adjust: {", "adjust: {tukey_c: 4.0, "))
+    said = optimize(copy, out, "--resume", "--config", str(other))
+    assert said.code == 2 and len(said.err.splitlines()) == 1
+    assert "configuration adjust.tukey_c was 4.685, is 4.0" in said.err
+    assert "--overwrite" in said.err
+
+    path = journeys_of(copy)[1] / "poses.parquet"
+    table = pq.read_table(path)
+    x = table["x"].to_numpy().copy()
+    x[3] += 1e-9
+    pq.write_table(table.set_column(table.column_names.index("x"), "x", pa.array(x)), path)
+    said = optimize(copy, out, "--resume")
+    assert said.code == 2 and len(said.err.splitlines()) == 1
+    assert "journey journey-001 has changed" in said.err
+
+    shutil.rmtree(journeys_of(copy)[1])
+    said = optimize(copy, out, "--resume")
+    assert said.code == 2 and "journey journey-001 is not there any more" in said.err
+
+    # All before any work, and nothing was touched.
+    assert cuts.calls == before
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == files
+
+
+def test_a_damaged_stage_is_made_anew(optimize, cuts: Cuts, small: Path, tmp_path: Path, run: Path):
+    out = tmp_path / "run"
+    cuts.cut = ("finish_map", 0)
+    with pytest.raises(Interruption):
+        optimize(small, out)
+    cuts.cut = None
+    damaged = [out / "checkpoint" / "journeys" / "00002.pt", out / "checkpoint" / "first_map.pt"]
+    for path in damaged:
+        path.write_bytes(path.read_bytes()[:-7])
+    said = optimize(small, out, "--resume")
+    assert said.code == 0 and cuts.calls["map_journey"] == 4 and cuts.calls["first_map"] == 2
+    for path in damaged:
+        assert f"resuming: {path}: is cut off" in said.err
+    assert "resuming: 2 of 3 journeys, step " in said.err
+    assert same_map(out, run)
+
+
+def test_overwrite_replaces_a_run(optimize, run: Path, copy: Path, tmp_path: Path):
+    out = Path(shutil.copytree(run, tmp_path / "run"))
+    shutil.rmtree(journeys_of(copy)[-1])
+    shutil.rmtree(copy / "survey")
+    said = optimize(copy, out, "--overwrite")
+    assert said.code == 0
+    listed = json.loads((out / "map" / "map.json").read_text())["provenance"]["journeys"]
+    assert listed == ["journey-000", "journey-001"]
+    assert [p.name for p in journeys_of(out)] == listed
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["survey"] is None and metrics["counts"]["journeys"] == 2
+    assert len(list((out / "tensorboard").iterdir())) == 1
+
+
+def test_an_older_map_stays_while_the_new_one_is_not_complete(
+    optimize, cuts: Cuts, run: Path, small: Path, tmp_path: Path
+):
+    out = Path(shutil.copytree(run, tmp_path / "run"))
+    before = {p: p.read_bytes() for p in (out / "map").iterdir()}
+    cuts.cut = ("adjust_step", 1)
+    with pytest.raises(Interruption):
+        optimize(small, out, "--overwrite")
+    assert {p: p.read_bytes() for p in (out / "map").iterdir()} == before
+
+
+# What stops a run.
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_older_map(
+    optimize, run: Path, small: Path, tmp_path: Path, monkeypatch
+):
+    out = Path(shutil.copytree(run, tmp_path / "run"))
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    # What a run goes on from is not part of its result.
+    del before[out / "checkpoint" / "inputs.json"]
+
+    def full(path: Path, record: object) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(optimize_command, "write_report", full)
+    said = optimize(small, out, "--overwrite")
+    assert said.code == 1
+    assert said.err.splitlines()[-1] == (
+        f"crowdmap optimize: {out}/unfinished/report.html: No space left on device; what was finished is kept: "
+        "the same command with --resume goes on; the older result stands"
+    )
+    assert {p: p.read_bytes() for p in before} == before
+    assert {p.name for p in (out / "unfinished").iterdir()} == {"tensorboard"}
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="nobody may mount")
+@pytest.mark.parametrize("kilobytes", [16, 200])
+def test_a_small_disk_is_one_line(optimize, small: Path, tmp_path: Path, kilobytes: int):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(disk)]
+    if subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("nobody may mount")
+    try:
+        said = optimize(small, disk / "run")
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+    last = said.err.splitlines()[-1]
+    assert said.code == 1 and "Traceback" not in said.err
+    assert last.startswith(f"crowdmap optimize: {disk}/run/") and "No space left on device" in last
+
+
+def test_a_folder_that_another_run_writes_is_refused_before_anything_is_read(
+    optimize, tmp_path: Path
+):
+    folder = RunFolder(tmp_path / "run")
+    with folder.claimed():
+        said = optimize(tmp_path / "no dataset", folder.path)
+    assert said.code == 2 and said.err.count("\n") == 1 and "writes there" in said.err
+
+
+@pytest.mark.parametrize("place", ["file/run", "link", "/proc/run", "x" * 300])
+def test_a_place_for_no_folder_is_refused_before_anything_is_read(
+    optimize, tmp_path: Path, place: str
+):
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "nothing")
+    said = optimize(tmp_path / "no dataset", tmp_path / place)
+    assert said.code == 2 and said.err.count("\n") == 1 and "no dataset" not in said.err
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="nobody tells who are children")
+@pytest.mark.parametrize(
+    ("stage", "workers", "number", "code"),
+    [("single journeys", "2", signal.SIGINT, 130), ("clusters", "1", signal.SIGTERM, 143)],
+)
+def test_a_signal_is_one_line_and_leaves_nobody_behind(
+    small: Path,
+    rough: Path,
+    tmp_path: Path,
+    stage: str,
+    workers: str,
+    number: signal.Signals,
+    code: int,
+):
+    out = tmp_path / "run"
+    program = begin(
+        *("-m", "crowdmap_torch", "optimize", str(small), "--out", str(out)),
+        *("--config", str(rough), "--workers", workers),
+    )
+    assert program.stderr is not None
+    if stage == "single journeys":
+        while len(children(program.pid)) < 2:
+            assert program.poll() is None
+            time.sleep(0.02)
+    else:
+        said = [program.stderr.readline()]
+        while not said[-1].startswith(stage):
+            assert said[-1], said
+            said.append(program.stderr.readline())
+    begun_by_it = children(program.pid)
+    program.send_signal(number)
+    begun = time.monotonic()
+    _, rest = program.communicate(timeout=PATIENCE_S)
+    assert program.returncode == code
+    # Five seconds are promised on a machine that has nothing else to do.
+    assert time.monotonic() - begun < 30
+    *progress, last = rest.splitlines()
+    assert last == (
+        f"crowdmap optimize: ended by {number.name}; what was finished is kept: "
+        "the same command with --resume goes on"
+    )
+    assert all(line.startswith(("clusters", "bundle", "single")) for line in progress)
+    assert all(ends(worker, PATIENCE_S) for worker in begun_by_it)
+    assert not (out / "run.lock").exists() and not (out / "map").exists()
