@@ -136,11 +136,14 @@ def interrupt(chosen: Sequence[Cut], keep: Path) -> Iterator[Verdict]:
 def report(verdicts: Iterable[Verdict]) -> int:
     """Prints what fails and a table of all; 0 if everything held."""
     rows: dict[tuple[str, int], list[Verdict]] = {}
+    begun = time.monotonic()
     for verdict in verdicts:
         cut = verdict.cut
         rows.setdefault((cut.number.name, cut.workers), []).append(verdict)
         if verdict.problems:
             print(f"{cut}: {verdict.problems}", flush=True)
+        if (done := sum(map(len, rows.values()))) % 10 == 0:
+            print(f"{done} in {time.monotonic() - begun:.0f} s", flush=True)
     for (name, workers), some in rows.items():
         stages = Counter(verdict.cut.stage for verdict in some)
         print(

@@ -281,21 +281,52 @@ def test_a_full_disk_is_one_line_and_leaves_the_older_map(
     assert {p.name for p in (out / "unfinished").iterdir()} == {"tensorboard"}
 
 
-@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="nobody may mount")
-@pytest.mark.parametrize("kilobytes", [16, 200])
-def test_a_small_disk_is_one_line(optimize, small: Path, tmp_path: Path, kilobytes: int):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(disk)]
-    if subprocess.run(mount, check=False, capture_output=True).returncode:
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """Gives a small disk options such as its size; only some may mount."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "tmpfs", str(place)]
+    if (
+        os.geteuid() != 0
+        or shutil.which("mount") is None
+        or subprocess.run(mount, check=False, capture_output=True).returncode
+    ):
         pytest.skip("nobody may mount")
-    try:
-        said = optimize(small, disk / "run")
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
+
+    def remount(options: str) -> Path:
+        subprocess.run(["mount", "-o", f"remount,{options}", str(place)], check=True)
+        return place
+
+    yield remount
+    subprocess.run(["umount", str(place)], check=True)
+
+
+@pytest.mark.parametrize("kilobytes", [16, 200])
+def test_a_small_disk_is_one_line_and_a_larger_one_takes_the_rest(
+    optimize, small: Path, run: Path, disk: Callable[[str], Path], kilobytes: int
+):
+    out = disk(f"size={kilobytes}k") / "run"
+    said = optimize(small, out)
     last = said.err.splitlines()[-1]
     assert said.code == 1 and "Traceback" not in said.err
-    assert last.startswith(f"crowdmap optimize: {disk}/run/") and "No space left on device" in last
+    assert last.startswith(f"crowdmap optimize: {out}/") and "No space left on device" in last
+    disk("size=64m")
+    assert optimize(small, out, "--resume").code == 0
+    assert same_map(out, run)
+
+
+def test_a_disk_that_may_only_be_read_is_one_line(
+    optimize, run: Path, small: Path, disk: Callable[[str], Path]
+):
+    out = Path(shutil.copytree(run, disk("rw") / "run"))
+    disk("ro")
+    for place, options in ((out, ["--overwrite"]), (out, ["--resume"]), (out.parent / "new", [])):
+        said = optimize(small, place, *options)
+        assert said.code == 1 and said.err.count("\n") == 1
+        assert said.err.startswith(f"crowdmap optimize: {place}")
+        assert "Read-only file system" in said.err
+    assert same_map(out, run)
 
 
 def test_a_folder_that_another_run_writes_is_refused_before_anything_is_read(
