@@ -40,6 +40,7 @@ from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.record import record_of
+from crowdmap_torch.report.stages import keep_and_log, log_crowd
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.report.watch import Watch
 from crowdmap_torch.runs.checkpoint import Checkpoint, Found, inputs_of
@@ -111,9 +112,7 @@ def _map(
         found = _take_up(kept, folder, len(dataset.journeys), device) if options.resume else Found()
     if found is None:
         return 0
-    with reading(config.reading):
-        findings = look_over(options.dataset, dataset, config.positioning, config.sign_association)
-    _tell(findings, dataset)
+    findings = _looked_over(options.dataset, dataset, config)
 
     progress = Progress()
     folder.prepare()
@@ -129,23 +128,25 @@ def _map(
             workers=options.workers,
             progress=progress,
             known=found.journeys,
-            keep=kept.keep_journey,
+            keep=keep_and_log(kept.keep_journey, log, journeys),
         )
 
         # ---- landmarks of all journeys told apart, biases found (section V-A) ----
         progress("clusters and biases")
         first = found.first or kept.keep_first(mapper.first_map(journeys, maps, config))
+        if found.first is None:
+            log_crowd(log, dataset, first)
 
         # ---- everything at once (section V-B) ----
         progress("bundle adjustment: building")
         bundle = mapper.build_bundle(journeys, maps, first, config, control=given.pins(device))
         watch = Watch(log, survey, first.signs, first.lanes, every=options.log_every)
-        if found.step is None:
-            begun = adjust.start(bundle)
+        step = found.step
+        begun = adjust.start(bundle) if step is None else adjust.go_on(bundle, step.standing)
+        if found.start is None:
             kept.keep_start(watch.start(bundle, mapper.clusters_map(dataset, first)))
         else:
-            begun = adjust.go_on(bundle, found.step.standing)
-            watch.go_on(found.start, found.step.course)
+            watch.go_on(found.start, found.course)
         state, most = begun, config.adjust.lm.max_iterations
         for iteration, state in adjust.steps(bundle, begun, first=found.steps):
             watch.step(iteration, state, bundle)
@@ -229,6 +230,13 @@ def _load(folder: Path, device: torch.device, *, strict: bool) -> Dataset:
 def _tell_rejected(rejected: Sequence[RejectedJourney]) -> None:
     for journey in rejected:
         print(f"set aside {journey.journey_id}: {journey.reason}", file=sys.stderr)
+
+
+def _looked_over(folder: Path, dataset: Dataset, config: MapperConfig) -> tuple[Finding, ...]:
+    with reading(config.reading):
+        findings = look_over(folder, dataset, config.positioning, config.sign_association)
+    _tell(findings, dataset)
+    return tuple(findings)
 
 
 def _tell(findings: Sequence[Finding], dataset: Dataset) -> None:

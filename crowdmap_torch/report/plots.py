@@ -37,6 +37,11 @@ MAP, SURVEY, BEFORE, WRONG, FAINT, INK = (
 """Colours of the map, the survey, the map before adjustment, errors, what lies behind, and text."""
 SERIES = (MAP, BEFORE, SURVEY, "#8a56b8", WRONG, "#3aa0a8", "#7a8594")
 
+_CELLS_ACROSS = 24
+"""Of an image, in the plot of residuals over it."""
+_LEAST_IN_A_CELL = 5
+_MOST_DOTS = 20_000
+
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": "#9aa4b2",
     "axes.labelcolor": INK,
@@ -204,6 +209,39 @@ def plot_residuals(residual_px: Mapping[str, Float[Tensor, " n"]]) -> Figure:
     axes.set(xlabel="residual [px]", ylabel="share below", ylim=(0, 1.02))
     if axes.lines:
         axes.legend(loc="upper left")
+    return figure
+
+
+@styled
+def plot_residuals_over_image(
+    px: Float[Tensor, "n 2"], residual: Float[Tensor, "n 2"], size: tuple[int, int]
+) -> Figure:
+    """Median residual in each cell of the image, as an arrow: a pattern is a camera that is not calibrated."""
+    width, height = size
+    figure, (axes,) = new_figure(1, width=6.0, height=6.0 * min(height / width, 1.5))
+    px, residual = px.detach().cpu(), residual.detach().cpu()
+    seen = ((px >= 0) & (px < px.new_tensor([width, height]))).all(1) & residual.isfinite().all(1)
+    px, residual = px[seen], residual[seen]
+    cell = width / _CELLS_ACROSS
+    column, row = (px / cell).long().unbind(-1)
+    key = row * _CELLS_ACROSS + column
+    axes.plot(*px[:: len(px) // _MOST_DOTS + 1].unbind(-1), ",", color=FAINT)
+    middle, arrow = [], []
+    for k in key.unique().tolist():
+        own = residual[key == k]
+        if len(own) >= _LEAST_IN_A_CELL:
+            middle.append(((k % _CELLS_ACROSS + 0.5) * cell, (k // _CELLS_ACROSS + 0.5) * cell))
+            arrow.append(own.median(0).values.tolist())
+    if arrow:
+        (x, y), (u, v) = zip(*middle, strict=True), zip(*arrow, strict=True)
+        longest = max(float(np.hypot(u, v).max()), 1e-9)
+        drawn = axes.quiver(
+            x, y, u, v, angles="xy", scale_units="xy", scale=longest / cell, color=MAP, width=0.002
+        )
+        axes.quiverkey(drawn, 0.9, 1.03, longest, f"{longest:.2f} px")
+    axes.set(xlim=(0, width), ylim=(height, 0), xlabel="u [px]", ylabel="v [px]")
+    axes.set_title("median residual, projected minus detected")
+    axes.set_aspect("equal")
     return figure
 
 

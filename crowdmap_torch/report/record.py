@@ -17,6 +17,7 @@ from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.plots import Eigengap
+from crowdmap_torch.report.stages import eigengaps_of
 from crowdmap_torch.report.summaries import (
     JourneySummary,
     Pruned,
@@ -27,9 +28,6 @@ from crowdmap_torch.report.summaries import (
 )
 from crowdmap_torch.report.watch import Watch
 from crowdmap_torch.tables import Dataset, HdMap, RejectedJourney, Survey
-
-_EIGENVALUES_SHOWN = 60
-"""Beyond a gap."""
 
 
 @dataclass(frozen=True)
@@ -110,15 +108,8 @@ def record_of(
         pruned=pruned_of(dataset, result, config),
         warnings=tuple(warnings),
         rejected=dataset.rejected,
-        outlier_journeys=outlier_journeys_of(dataset, result),
-        spectra=tuple(
-            Eigengap(
-                f"signs, d_c = {s.scale:g} m",
-                tuple(s.eigenvalues[: s.count + _EIGENVALUES_SHOWN].tolist()),
-                s.count,
-            )
-            for s in result.first.crowd.report.spectra
-        ),
+        outlier_journeys=outlier_journeys_of(dataset, result.first),
+        spectra=eigengaps_of(result.first),
         residual_px=watch.residual_px,
         iterations=tuple(watch.iterations),
         outcome=result.state.reasons[0],

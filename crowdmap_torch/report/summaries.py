@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.truth import Truth
-from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.mapper import FirstMap, MapResult
 from crowdmap_torch.report.fates import MAPPED, lane_fates, sign_fates
 from crowdmap_torch.tables import Dataset, RejectedJourney
 
@@ -45,11 +45,11 @@ class Pruned:
     count: int
 
 
-def outlier_journeys_of(dataset: Dataset, result: MapResult) -> tuple[RejectedJourney, ...]:
+def outlier_journeys_of(dataset: Dataset, first: FirstMap) -> tuple[RejectedJourney, ...]:
     """Journeys that do not fit the others, with the reason."""
     return tuple(
         RejectedJourney(dataset.journeys[found.journey].journey_id, found.reason)
-        for found in result.first.crowd.report.outlier_journeys
+        for found in first.crowd.report.outlier_journeys
     )
 
 

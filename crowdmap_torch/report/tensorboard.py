@@ -1,4 +1,4 @@
-"""The event files that TensorBoard shows while a map is being adjusted."""
+"""The event files that TensorBoard shows while a map is being made."""
 
 from __future__ import annotations
 
@@ -97,8 +97,12 @@ class TensorBoardLog:
 
     def log_config(self, config_yaml: str) -> None:
         """The configuration as text."""
-        # Four blanks make Markdown show it as it is.
-        self._writer.add_text("config", "\n".join(f"    {s}" for s in config_yaml.splitlines()))
+        self.log_text("config", config_yaml)
+
+    def log_text(self, tag: str, text: str) -> None:
+        """Lines as they are."""
+        # Four blanks make Markdown show them so.
+        self._writer.add_text(tag, "\n".join(f"    {line}" for line in text.splitlines()))
 
     def log_iteration(
         self, iteration: Iteration, *, down_weighted: Mapping[str, float] | None = None

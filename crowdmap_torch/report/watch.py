@@ -14,12 +14,16 @@ from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.evaluation.evaluate import progress_scalars
 from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.optim.linearize import residuals
+from crowdmap_torch.report import plots
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.tables import HdMap, Lanes, Signs, Survey
 
 _LANES_EVERY = 5
 """Lanes are compared with the survey every this many steps: it takes longer than a step."""
+
+_MOST_CAMERAS = 4
+"""Whose residuals are drawn: those that saw most."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ class Watch:
     def start(self, bundle: Bundle, map_before: HdMap) -> Residuals:
         """The map of the cluster heads and its residuals, before the first step."""
         self._log.log_map("map/before", map_before, self._survey, 0)
-        self.residual_px["cluster heads"] = pixel_residuals(bundle)
+        self.residual_px["cluster heads"] = corner_residuals(bundle).norm(dim=-1)
         errors = self._errors(bundle, with_lanes=True)
         self._log.log_scalars(errors, 0)
         return Residuals(self.residual_px)
@@ -111,8 +115,19 @@ class Watch:
     @torch.no_grad()
     def finish(self, bundle: Bundle, hd_map: HdMap) -> None:
         """The adjusted map and its residuals."""
-        self._log.log_map("map/after", hd_map, self._survey, len(self.iterations))
-        self.residual_px["adjusted map"] = pixel_residuals(bundle)
+        steps = len(self.iterations)
+        self._log.log_map("map/after", hd_map, self._survey, steps)
+        residual = corner_residuals(bundle)
+        self.residual_px["adjusted map"] = residual.norm(dim=-1)
+        self._log.log_figure("residual/by_stage", plots.plot_residuals(self.residual_px), steps)
+        camera = bundle.corners.lens.cpu()
+        most = torch.bincount(camera, minlength=len(bundle.lenses)).argsort(descending=True)
+        for number in most[:_MOST_CAMERAS].tolist():
+            lens, of = bundle.lenses[number], camera == number
+            figure = plots.plot_residuals_over_image(
+                bundle.corners.px.cpu()[of], residual[of], (lens.width, lens.height)
+            )
+            self._log.log_figure(f"residual/over_image_{number}", figure, steps)
 
     def _errors(self, bundle: Bundle, *, with_lanes: bool) -> dict[str, float]:
         if self._survey is None or not len(self._signs):
@@ -121,9 +136,9 @@ class Watch:
         return progress_scalars(signs, self._survey, lanes=lanes if with_lanes else None)
 
 
-def pixel_residuals(bundle: Bundle) -> Float[Tensor, " m"]:
-    """Length of every sign corner's reprojection error [px]."""
+def corner_residuals(bundle: Bundle) -> Float[Tensor, "m 2"]:
+    """Every sign corner's reprojection error in u and v, on the CPU [px]."""
     term = bundle.problem().terms.get("sign_reprojection")
     if term is None or not len(term):
-        return bundle.scale.new_zeros(0)
-    return (residuals(term, bundle.values()).norm(dim=-1) * bundle.corner_sigma()).cpu()
+        return torch.zeros(0, 2, dtype=bundle.scale.dtype)
+    return (residuals(term, bundle.values()) * bundle.corner_sigma()[:, None]).cpu()

@@ -58,7 +58,7 @@ class Found:
     journeys: Mapping[int, JourneyMap] = field(default_factory=dict)
     """By number."""
     first: FirstMap | None = None
-    start: Residuals = field(default_factory=lambda: Residuals({}))
+    start: Residuals | None = None
     """Before the first step."""
     step: Step | None = None
     damaged: tuple[str, ...] = ()
@@ -68,6 +68,11 @@ class Found:
     def steps(self) -> int:
         """How many steps of the adjustment were taken."""
         return 0 if self.step is None else self.step.standing.steps
+
+    @property
+    def course(self) -> Course:
+        """The steps that were taken, as they were watched."""
+        return Course(()) if self.step is None else self.step.course
 
     def lines(self, journeys: int) -> list[str]:
         """What was damaged, a line each, and in the last one what was found."""

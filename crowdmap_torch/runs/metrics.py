@@ -42,7 +42,7 @@ def metrics_of(
         ],
         "outcome": result.state.reasons[0],
         "rejected_journeys": plain(dataset.rejected),
-        "suspect_journeys": plain(outlier_journeys_of(dataset, result)),
+        "suspect_journeys": plain(outlier_journeys_of(dataset, result.first)),
         "journeys": [
             {
                 "journey_id": s.journey_id,

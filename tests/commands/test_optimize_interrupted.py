@@ -16,6 +16,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from worlds.drives import write_tiny
 from worlds.programs import PATIENCE_S, begin
 from worlds.runs import Said, journeys_of
@@ -138,6 +139,17 @@ def same_map(one: Path, other: Path) -> bool:
     return not differences(one, other)
 
 
+def assert_board_shows_all_once(folder: Path, *, journeys: int, steps: int) -> None:
+    """Every stage is there, whichever of the runs made it, and none twice."""
+    board = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    for tag in board.Tags()["scalars"]:
+        logged = [event.step for event in board.Scalars(tag)]
+        assert len(set(logged)) == len(logged), tag
+    assert len(board.Scalars("association/sign_tracklets")) == journeys
+    assert len(board.Scalars("bias/up_m")) == journeys
+    assert len(board.Scalars("cost/total")) == steps
+
+
 def test_a_run_cut_again_and_again_repeats_nothing_and_ends_with_the_same_bits(
     optimize, cuts: Cuts, small: Path, tmp_path: Path, run: Path
 ):
@@ -159,6 +171,8 @@ def test_a_run_cut_again_and_again_repeats_nothing_and_ends_with_the_same_bits(
             with pytest.raises(Interruption):
                 optimize(small, out, *options)
             assert (out / "checkpoint" / "inputs.json").exists()
+            if cut[0] == "metrics_of":
+                assert_board_shows_all_once(out / "tensorboard", journeys=3, steps=steps)
             continue
         said = optimize(small, out, *options)
         assert said.code == 0 and f"resuming: {found}\n" in said.err

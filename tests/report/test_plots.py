@@ -6,6 +6,7 @@ import matplotlib as mpl
 import pytest
 import torch
 from matplotlib._pylab_helpers import Gcf
+from matplotlib.quiver import Quiver
 
 from crowdmap_torch.evaluation.evaluate import evaluate_map
 from crowdmap_torch.evaluation.signs import compare_signs
@@ -19,6 +20,16 @@ from crowdmap_torch.report.summaries import JourneySummary
 from crowdmap_torch.tables import Survey
 
 
+def over_image() -> tuple[torch.Tensor, torch.Tensor]:
+    """Corners all over an image of 1280 x 720, the residuals of a lens whose distortion is wrong, an outlier and a NaN."""
+    px = torch.rand(4000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    px = px * px.new_tensor([1280, 720])
+    away = (px - px.new_tensor([640, 360])) / 640
+    residual = 3 * away * away.norm(dim=1, keepdim=True) ** 2
+    residual[0], residual[1] = 1000, torch.nan
+    return px, residual
+
+
 def every_plot(record: RunRecord):
     assert record.comparison is not None
     return [
@@ -28,6 +39,7 @@ def every_plot(record: RunRecord):
         plots.plot_eigengaps(record.spectra),
         plots.plot_residuals(record.residual_px),
         plots.plot_convergence(record.iterations),
+        plots.plot_residuals_over_image(*over_image(), (1280, 720)),
     ]
 
 
@@ -40,6 +52,19 @@ def test_every_plot_can_be_an_svg_and_an_image(record):
         assert image.std() > 0
 
 
+def test_arrows_over_the_image_are_medians_where_corners_were_seen():
+    px, residual = over_image()
+    axes = plots.plot_residuals_over_image(px, residual, (1280, 720)).axes[0]
+    arrows = next(c for c in axes.collections if isinstance(c, Quiver))
+    middle = torch.as_tensor(arrows.get_offsets())
+    found = torch.stack([torch.as_tensor(x) for x in (arrows.U, arrows.V)], dim=1)
+    # The distortion at the middle of each cell of 53 px, across which it changes by 0.9 px at most.
+    away = (middle - middle.new_tensor([640, 360])) / 640
+    expected = 3 * away * away.norm(dim=1, keepdim=True) ** 2
+    assert len(middle) > 250
+    assert (found - expected).abs().max() < 0.5
+
+
 def test_drawing_leaves_no_global_state(record):
     before = dict(mpl.rcParams)
     every_plot(record)
@@ -49,10 +74,12 @@ def test_drawing_leaves_no_global_state(record):
 
 @pytest.mark.parametrize("residual", [torch.zeros(0), torch.full((3,), torch.nan), torch.zeros(5)])
 def test_nothing_to_draw_is_drawn(build, record, residual):
+    both = residual[:, None].expand(-1, 2)
     nothing = build.hd_map(build.signs(torch.zeros(0, 3, dtype=torch.float64)))
     figures = [
         plots.plot_map(nothing),
         plots.plot_residuals({"a": residual}),
+        plots.plot_residuals_over_image(both, both, (8, 6)),
         plots.plot_convergence([Iteration(0, {"a": 0.0}, 1.0, 0.0, 0.0)]),
         plots.plot_eigengaps([Eigengap("one", (0.0,), 1), Eigengap("none", (), 0)]),
         plots.plot_bias([JourneySummary("a", 0, 0, 0, 0, (0.0, 0.0, 0.0))]),

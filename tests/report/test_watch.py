@@ -11,7 +11,7 @@ from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.report.tensorboard import TensorBoardLog
-from crowdmap_torch.report.watch import Watch, pixel_residuals
+from crowdmap_torch.report.watch import Watch, corner_residuals
 from crowdmap_torch.tables import Dataset, Survey
 
 
@@ -51,9 +51,20 @@ def test_errors_and_residuals_are_those_of_the_steps_looked_at(watched):
     assert [e.step for e in events.Scalars("error/corner_m")] == [0, 1, 3]
 
 
-def test_pixel_residuals_are_lengths_and_smaller_after_the_adjustment(watched):
+def test_corner_residuals_are_in_pixels_and_smaller_after_the_adjustment(watched):
     watch, bundle, _ = watched
     before, after = watch.residual_px["cluster heads"], watch.residual_px["adjusted map"]
     assert len(before) == len(after) == len(bundle.corners)
     assert (after >= 0).all() and after.median() < before.median()
-    assert torch.equal(pixel_residuals(bundle), after)
+    assert torch.equal(corner_residuals(bundle).norm(dim=-1), after)
+
+
+def test_map_and_residuals_are_drawn_before_and_after(watched):
+    _, bundle, events = watched
+    cameras = [f"residual/over_image_{k}" for k in range(len(bundle.lenses))]
+    assert set(events.Tags()["images"]) == {
+        "map/before",
+        "map/after",
+        "residual/by_stage",
+        *cameras,
+    }
