@@ -95,14 +95,13 @@ class MapperConfig(Settings):
             road=replace(self.road, method="paper2017"),
             lane=replace(self.lane, method="paper2017"),
             crowd=replace(self.crowd, method="paper2017"),
-            # eq:ba weighs all pixels alike, and knows neither what signs are like nor a road under its lanes; what a
-            # detection does to its own pose it does not ask.
+            # eq:ba knows neither boxes nor what signs are like, nor a road under its lanes.
             adjust=replace(
                 self.adjust,
+                method="paper2017",
+                box_sigma=0.0,
                 habit=SignHabit(facing_rad=math.inf, upright_rad=math.inf, log_size=math.inf),
                 lane_height_sigma_m=math.inf,
-                lane_correlation=1.0,
-                innovation_chance=0.0,
             ),
         )
 

@@ -266,7 +266,7 @@ class Bundle(nn.Module):
         What they are judged by is their innovation: of the nearest view of a sign the residual says little, as the pose
         goes where that view wants it. From the first time on the bound on residuals is as narrow as it is to be.
         """
-        if int(self.judged) >= _MOST_JUDGEMENTS:
+        if self.config.method == "paper2017" or int(self.judged) >= _MOST_JUDGEMENTS:
             return False
         problem, values, given_up = self.problem(), self.values(), torch.zeros_like(self.given_up)
         if self.config.innovation_chance and len(self.corners):
@@ -283,6 +283,25 @@ class Bundle(nn.Module):
 
     def _narrow(self, values: dict[str, Tensor]) -> bool:
         """Narrows the scales of pixels to what the residuals show; returns whether they have come to rest."""
+        alike = self.config.method == "paper2017"
+        seen, small_box = (self._seen_alike if alike else self._seen_by_kind)(values)
+        narrows = seen < _NARROWS * self.scale
+        self.scale.copy_(torch.where(narrows, seen, self.scale))
+        self.small_box.copy_(torch.where(narrows[0], small_box, self.small_box))
+        return not bool(narrows.any())
+
+    def _seen_alike(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """As `_seen_by_kind`, one scale for every pixel, of signs and of lanes."""
+        parts = [whitened_residuals(t, values).flatten() for t in self._corner_term(1.0).values()]
+        if len(self.lane_points):
+            lanes = whitened_residuals(self._lane_terms(1.0)["lane_reprojection"], values)
+            parts.append(lanes[self.matches.valid, 0])
+        residual = torch.cat([self.scale[:0], *parts])
+        scale = median_scale(residual, floor=self.config.sign_sigma_px)
+        return torch.stack((scale, scale, torch.ones_like(scale))), torch.zeros_like(self.small_box)
+
+    def _seen_by_kind(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """`scale` and `small_box` as the residuals show them."""
         config = self.config
         seen = self.scale.new_tensor(
             [config.sign_sigma_px, config.lane_sigma_px, config.lane_correlation]
@@ -302,10 +321,7 @@ class Bundle(nn.Module):
             seen[1] = median_scale(residual, floor=config.lane_sigma_px)
             together = shared_error(residual, rows.frame[valid], rows.detection[valid])
             seen[2] = together.clamp_min(config.lane_correlation)
-        narrows = seen < _NARROWS * self.scale
-        self.scale.copy_(torch.where(narrows, seen, self.scale))
-        self.small_box.copy_(torch.where(narrows[0], small_box, self.small_box))
-        return not bool(narrows.any())
+        return seen, small_box
 
     def problem(self) -> Problem:
         """The least-squares problem with the matches and scales of the moment, lanes held where they are.
@@ -353,18 +369,25 @@ class Bundle(nn.Module):
         rows = self.corners
         if not len(rows):
             return {}
-        reach = _FIRST_REACH if int(self.judged) == 0 else 1.0
-        bound = self.scale.new_tensor(self.config.tukey_c * reach)
-        loss = JointTukey.by_efficiency(rows.detection, bound, row_dim=_PIXEL_DIM)
+        alone = self.config.method == "paper2017"
+        loss = Tukey(self.config.tukey_c) if alone else self._loss_of_detections()
         term = CostTerm(
             reprojection.sign_reprojection,
             (("pose", rows.frame), ("sign", rows.sign), ("size", rows.sign)),
             (rows.template, rows.matrix),
             rows.template.new_ones(len(rows)) / sigma,
-            loss.without(self.given_up[rows.detection]),
+            loss,
             reprojection.sign_reprojection_jacobian,
         )
         return {"sign_reprojection": term}
+
+    def _loss_of_detections(self) -> JointTukey:
+        """The loss of whole detections, those that are given up of no account."""
+        detection = self.corners.detection
+        reach = _FIRST_REACH if int(self.judged) == 0 else 1.0
+        bound = self.scale.new_tensor(self.config.tukey_c * reach)
+        loss = JointTukey.by_efficiency(detection, bound, row_dim=_PIXEL_DIM)
+        return loss.without(self.given_up[detection])
 
     def _size_term(self) -> dict[str, CostTerm]:
         size = self.values()["size"].detach()

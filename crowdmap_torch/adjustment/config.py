@@ -18,11 +18,13 @@ from crowdmap_torch.ranges import (
     Range,
     Settings,
     Sigma,
+    SigmaOrNone,
     SigmaOrOff,
     Spacing,
 )
 from crowdmap_torch.residuals.sign_prior import SignHabit
 
+METHODS = ("joint", "paper2017")
 JACOBIANS = ("closed", "autograd")
 
 
@@ -30,6 +32,9 @@ JACOBIANS = ("closed", "autograd")
 class AdjustConfig(Settings):
     """Bundle adjustment (V-B)."""
 
+    method: str = "joint"
+    """`joint`: detections stand or fall as a whole, corners of small boxes and lane points weigh what their own residuals
+    say. `paper2017`: eq:ba with Tukey's weights of every corner and lane point by itself, all pixels weighed alike."""
     lm: lm.LmConfig = field(
         default_factory=lambda: lm.LmConfig(
             max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9, max_stretch=3.0
@@ -45,9 +50,11 @@ class AdjustConfig(Settings):
     """Residuals beyond this many standard deviations have no weight; the corners of a detection are judged together, by a
     bound that is as efficient."""
     sign_sigma_px: Pixels = 0.5
-    """Least standard deviation of a sign corner of a large box; more where the residuals say so."""
-    box_sigma: Sigma = 0.5
-    """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, as a share of them."""
+    """Least standard deviation of a sign corner of a large box; more where the residuals say so. Method `paper2017`: of
+    any pixel."""
+    box_sigma: SigmaOrNone = 0.5
+    """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, as a share of them; 0: boxes are
+    taken for outlines."""
     habit: SignHabit = field(default_factory=SignHabit)
     """What signs are like before anything is seen of them."""
     size_classes_m: tuple[tuple[Length, Length], ...] = ()
@@ -90,8 +97,10 @@ class AdjustConfig(Settings):
     """Samples of the map that such covariances are estimated from; their sigmas are then good to 9 %."""
 
     def __post_init__(self) -> None:
-        """Refuses unknown jacobians."""
+        """Refuses unknown methods and Jacobians."""
         super().__post_init__()
+        if self.method not in METHODS:
+            raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
         if self.jacobians not in JACOBIANS:
             raise ValueError(
                 f"jacobians: expected one of {', '.join(JACOBIANS)}, found {self.jacobians!r}"

@@ -11,7 +11,7 @@ import torch
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.mapper import MapResult, build_bundle
-from crowdmap_torch.optim.linearize import term_costs
+from crowdmap_torch.optim.linearize import residuals, term_costs
 from crowdmap_torch.tables import Dataset
 
 
@@ -55,3 +55,34 @@ def test_a_bundle_that_was_loaded_has_the_matches_and_scales_of_the_other(
     saved.refresh()
     loaded.refresh()
     assert costs(loaded) == costs(saved)
+
+
+def test_the_papers_cost_weighs_every_corner_and_lane_point_by_itself_and_all_pixels_alike(
+    tiny: Dataset, tiny_result: MapResult
+):
+    config = MapperConfig(method="paper2017").resolved().adjust
+    config = replace(config, frame_spacing_m=6.0)
+    bundle = build_bundle(
+        tiny.journeys,
+        tiny_result.journey_maps,
+        tiny_result.first,
+        replace(MapperConfig(), adjust=config),
+    )
+    found, values = costs(bundle), bundle.values()
+    sigma, of_lanes, factor = bundle.scale.unbind()
+    assert sigma == of_lanes and factor == 1.0
+    assert (bundle.corner_sigma() == sigma).all()
+
+    def tukey(error_px: list[float]) -> float:
+        c_px = config.tukey_c * float(sigma)
+        inside = max(1 - sum(e * e for e in error_px) / c_px**2, 0.0)
+        return config.tukey_c**2 / 6 * (1 - inside**3)
+
+    for name in ("sign_reprojection", "lane_reprojection"):
+        term = bundle.problem().terms[name]
+        assert term.weight is not None
+        residual = residuals(replace(term, weight=(term.weight > 0).to(sigma)), values)
+        total = sum(tukey(row) for row in residual.tolist())
+        assert found[name] == pytest.approx(total, rel=1e-9)
+    # Nothing else is judged, and what was found stays.
+    assert not bundle.judge(bundle.backend()) and not bundle.given_up.any()

@@ -235,6 +235,11 @@ def test_of_boxes_the_centre_counts_and_the_corners_hardly(signs: Signs, distort
     assert len(mine) == 5
     torch.testing.assert_close(mine.loose_px[:4], (high - low).max() / 4 * torch.ones(4).double())
     assert mine.loose_px[4] == 0
+    # Taken for outlines they are four corners like any other.
+    alike = corner_observations(
+        [replace(journey, signs=boxed)], [association], signs, box_sigma=0.0
+    )
+    assert len(alike[alike.sign == k]) == 4 and not alike.loose_px.any()
     torch.testing.assert_close(mine.template[4], torch.zeros(2).double(), rtol=0, atol=1e-12)
     # On the ray between those of the box's corners the error is zero.
     ray = torch.cat((ideal[k, :4].mean(0), torch.ones(1).double()))
