@@ -89,8 +89,8 @@ class MapperConfig(Settings):
             return self
         return replace(
             self,
-            sign_association=replace(self.sign_association, method="epipolar"),
-            lane_association=replace(self.lane_association, method="epipolar"),
+            sign_association=replace(self.sign_association, method="paper2017"),
+            lane_association=replace(self.lane_association, method="paper2017"),
             sign_triangulation=replace(self.sign_triangulation, method="paper2017"),
             road=replace(self.road, method="paper2017"),
             lane=replace(self.lane, method="paper2017"),

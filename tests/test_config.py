@@ -146,7 +146,6 @@ def test_methods_of_the_paper_reach_every_stage():
         for name, part in as_dict(config).items()
         if isinstance(part, dict) and "method" in part
     }
-    assert methods.pop("sign_association") == methods.pop("lane_association") == "epipolar"
     assert methods and set(methods.values()) == {"paper2017"}
     assert config.adjust.lane_height_sigma_m == math.inf
 

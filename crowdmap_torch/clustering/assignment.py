@@ -30,6 +30,23 @@ def gated_matching(
     return row[matched], column[matched]
 
 
+def matching_of_near(
+    cost: Float[np.ndarray, "n m"], gate: float
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Rows and columns of the matching of least total cost of those columns whose cheapest row costs `gate` at most.
+
+    The paper's spawning and matching (IV-A): the gate decides which columns take part, not whom they are matched with.
+    Only pairs of infinite cost are never matched. Rows come in ascending order.
+    """
+    near = np.flatnonzero(cost.min(0, initial=np.inf) <= gate)
+    cost = cost[:, near]
+    possible = np.isfinite(cost)
+    # Dearer than all that is possible together: taken only where nothing else is left, and dropped.
+    row, column = linear_sum_assignment(np.where(possible, cost, cost[possible].sum() + 1))
+    matched = possible[row, column]
+    return row[matched], near[column[matched]]
+
+
 @dataclass(frozen=True)
 class WindowPairs:
     """All pairs of rows whose times are at least 1 and at most a window apart, those of one later row adjacent."""

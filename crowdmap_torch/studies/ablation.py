@@ -23,8 +23,8 @@ VARIANTS: Mapping[str, MapperConfig] = {
     "ours": OURS,
     "association by the epipolar cost alone": replace(
         OURS,
-        sign_association=replace(OURS.sign_association, method="epipolar"),
-        lane_association=replace(OURS.lane_association, method="epipolar"),
+        sign_association=replace(OURS.sign_association, method="paper2017"),
+        lane_association=replace(OURS.lane_association, method="paper2017"),
     ),
     "signs one by one, poses as they are": replace(
         OURS, sign_triangulation=replace(OURS.sign_triangulation, method="paper2017")

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.geometry.epipolar import epipolar_cost, fundamental
-from crowdmap_torch.ranges import Cost, Count, Factor, Length, Pixels, Settings, Sigma, Span
+from crowdmap_torch.geometry.correspondence import vertex_costs
+from crowdmap_torch.geometry.epipolar import fundamental
+from crowdmap_torch.ranges import Cost, Count, Factor, Length, Settings, Sigma, Span
 from crowdmap_torch.tables import LaneDetections, LanePoints, Rig, Rows
 
-METHODS = ("ground", "epipolar")
+METHODS = ("ground", "paper2017")
 SAMPLES = 6
-"""Points by which a detection's line is compared."""
+"""Points by which a detection's line is compared, each with each of the other's where the method is the paper's."""
+
+
+@dataclass(frozen=True)
+class PaperLaneAssociation(Settings):
+    """What the paper leaves open of its association of lanes (IV-A)."""
+
+    window_frames: Count = 25
+    """Association window w: tracklets silent for longer are ignored [frames]."""
+    max_cost_px2: Cost = 5184.0
+    """A detection whose cost, summed over pairs of points, exceeds this with every tracklet starts one: 12 px for each of
+    36 pairs [px^2]."""
 
 
 @dataclass(frozen=True)
@@ -23,13 +35,14 @@ class LaneAssociationConfig(Settings):
     """How lane detections become tracklets (IV-A)."""
 
     method: str = "ground"
-    """`ground`: sideways distance on the calibrated road plane; `epipolar`: the paper's cost of an image line."""
+    """`ground`: sideways distance on the calibrated road plane; `paper2017`: the epipolar cost of the line's
+    image as printed."""
+    paper: PaperLaneAssociation = field(default_factory=PaperLaneAssociation)
+    """Method `paper2017`; all that follows is of `ground`."""
     window_frames: Count = 25
     """Tracklets silent for longer are ignored: the association window."""
     unmatched_cost: Cost = 9.0
-    """`ground`: a detection that costs more, mean square in standard deviations, starts a tracklet."""
-    max_epipolar_px: Pixels = 12.0
-    """`epipolar`: root mean square epipolar distance beyond which a detection starts a tracklet."""
+    """A detection that costs more, mean square in standard deviations, starts a tracklet."""
     sigma_m: Sigma = 0.2
     """Sideways noise of a line near the car."""
     sigma_per_m: Factor = 0.012
@@ -43,13 +56,18 @@ class LaneAssociationConfig(Settings):
     reach_m: Span = (2.0, 45.0)
     """Points nearer or further ahead on the road plane are left out."""
     chunk_pairs: Count = 1 << 13
-    """Pairs whose costs are computed at once."""
+    """Pairs whose costs are computed at once, of both methods."""
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
         super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
+
+    @property
+    def window(self) -> int:
+        """The association window of the method [frames]."""
+        return self.paper.window_frames if self.method == "paper2017" else self.window_frames
 
 
 @dataclass(frozen=True)
@@ -120,8 +138,8 @@ def lane_pair_costs(
     a: LaneFeatures, b: LaneFeatures, config: LaneAssociationConfig
 ) -> Float[Tensor, " p"]:
     """Cost of linking each lane detection of `a` with the later one of `b` in the same row."""
-    if config.method == "epipolar":
-        return _epipolar_costs(a, b)
+    if config.method == "paper2017":
+        return _printed_costs(a, b)
     cost = _ground_costs(a, b, config)
     differs = (a.type != b.type) & (a.type >= 0) & (b.type >= 0)
     return cost + config.type_penalty * differs
@@ -153,14 +171,14 @@ def _ground_costs(
     return torch.where(is_line, cost, torch.inf)
 
 
-def _epipolar_costs(a: LaneFeatures, b: LaneFeatures) -> Float[Tensor, " p"]:
-    """The paper's cost [px^2]: mean epipolar cost of points sampled from the image lines (IV-A).
+def _printed_costs(a: LaneFeatures, b: LaneFeatures) -> Float[Tensor, " p"]:
+    """The epipolar cost as printed, summed over all pairs of points of two lines (IV-A, Cost for lane association).
 
-    Unlike the paper, the mean and not the sum, so that the threshold does not depend on the number of samples.
+    A straight marker is its own epipolar line where the car goes along it: which point is which needs no answer.
     """
     F = fundamental(a.T_world_camera, b.T_world_camera)
-    cost = epipolar_cost(F[:, None], a.line_ideal, b.line_ideal)
-    return cost.mean(-1) * b.focal.square()
+    cost = vertex_costs(F, a.line_ideal, b.line_ideal, components=3)
+    return cost.sum((-1, -2)) * a.focal * b.focal
 
 
 def _sideways(curve: Float[Tensor, "p 3"], x: Float[Tensor, "p s"]) -> Float[Tensor, "p s"]:

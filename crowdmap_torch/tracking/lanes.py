@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.assignment import gated_matching
+from crowdmap_torch.clustering.assignment import gated_matching, matching_of_near
 from crowdmap_torch.tables import Journey, LaneDetections, LanePoints, Rig, Tracklets
 from crowdmap_torch.tracking.causal import (
     ActiveTracklets,
@@ -46,10 +46,12 @@ class LaneAssociator(CausalAssociator[ActiveTracklets, LaneFeatures]):
         if not len(rows):
             return rows
         silent_for = frame[rows[0]] - frame[self.active.last]
-        old = self.active[silent_for <= self.config.window_frames]
-        is_ground = self.config.method == "ground"
-        gate = self.config.unmatched_cost if is_ground else self.config.max_epipolar_px**2
-        row, column = gated_matching(pair_costs(old.last[:, None], rows[None]), gate)
+        old = self.active[silent_for <= self.config.window]
+        cost = pair_costs(old.last[:, None], rows[None])
+        if self.config.method == "paper2017":
+            row, column = matching_of_near(cost, self.config.paper.max_cost_px2)
+        else:
+            row, column = gated_matching(cost, self.config.unmatched_cost)
         label = self._labels(old, row, column, len(rows))
         silent = np.delete(np.arange(len(old)), row)
         self.active = old[silent].followed_by(ActiveTracklets(label, rows))
@@ -87,9 +89,7 @@ def associate_lanes(journey: Journey, config: LaneAssociationConfig) -> Tracklet
     order = torch.argsort(detections.frame, stable=True)
     features = features[order]
     pair_costs = partial(lane_pair_costs, config=config)
-    costs = window_costs(
-        features, pair_costs, window=config.window_frames, chunk=config.chunk_pairs
-    )
+    costs = window_costs(features, pair_costs, window=config.window, chunk=config.chunk_pairs)
     associator = LaneAssociator(config)
     frame = features.frame.cpu().numpy()
     label = np.full(len(order), -1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
@@ -14,10 +14,19 @@ from crowdmap_torch.geometry.epipolar import fundamental
 from crowdmap_torch.ranges import Cost, Count, Deviations, Length, Pixels, Settings, Sigma
 from crowdmap_torch.tables import Rows, SignDetections
 
-METHODS = ("predicted", "epipolar")
-CORNER_MATCHINGS = ("cyclic", "free")
+METHODS = ("predicted", "paper2017")
 CLEAR_ORDER = 0.5
 """The corner order is clear where it misses the template by less than this share of what the second best order does."""
+
+
+@dataclass(frozen=True)
+class PaperSignAssociation(Settings):
+    """What the paper leaves open of its association of signs (IV-A)."""
+
+    window_frames: Count = 10
+    """Association window w: tracklets silent for longer are ignored [frames]."""
+    max_cost_px2: Cost = 144.0
+    """A detection whose cost, summed over vertices, exceeds this with every tracklet starts one [px^2]."""
 
 
 @dataclass(frozen=True)
@@ -26,20 +35,20 @@ class SignAssociationConfig(Settings):
 
     method: str = "predicted"
     """`predicted`: the epipolar cost to the last measurement, and the distance to where the tracklet is predicted to appear
-    and how large; `epipolar`: the epipolar cost alone, as in the paper, of detections of its shape near the prediction."""
+    and how large; `paper2017`: the epipolar cost as printed, summed over vertices, and nothing else."""
+    paper: PaperSignAssociation = field(default_factory=PaperSignAssociation)
+    """Method `paper2017`; all that follows is of `predicted`."""
     window_frames: Count = 25
     """Association window w: tracklets silent for longer are ignored [frames]."""
-    corner_matching: str = "cyclic"
-    """Vertices are matched by the best cyclic `shift`; `free`: by any assignment, as the paper words it (slow)."""
     max_epipolar_px: Pixels = 6.0
     """A detection starts a new tracklet where the root mean epipolar cost over vertices exceeds this [px]."""
     max_distance: Deviations = 5.0
     """... or where it is this many standard deviations from every prediction: implausible motion."""
     unmatched_cost: Cost = 24.0
-    """What leaving a detection and a tracklet unmatched costs, as minus twice a log-likelihood; method `predicted`."""
+    """What leaving a detection and a tracklet unmatched costs, as minus twice a log-likelihood."""
     sure_after: Count = 3
     """From so many measurements on, a tracklet that agrees with its prediction may break the epipolar gate: the last
-    measurement may have been the wrong one; method `predicted`."""
+    measurement may have been the wrong one."""
     shape_penalty: Cost = 6.0
     """Added to the cost where a detection's shape is not the tracklet's shape by vote."""
     young_penalty: Cost = 4.0
@@ -60,16 +69,17 @@ class SignAssociationConfig(Settings):
     max_depth_m: Length = 500.0
     """Nor are those whose depth would exceed this."""
     chunk_pairs: Count = 1 << 13
-    """Pairs whose costs are computed at once; bounds the memory."""
+    """Pairs whose costs are computed at once; bounds the memory. Of both methods, as the noise of sightings is."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"sign association method {self.method!r}; expected one of {METHODS}")
-        if self.corner_matching not in CORNER_MATCHINGS:
-            raise ValueError(
-                f"corner matching {self.corner_matching!r}; expected one of {CORNER_MATCHINGS}"
-            )
+
+    @property
+    def window(self) -> int:
+        """The association window of the method [frames]."""
+        return self.paper.window_frames if self.method == "paper2017" else self.window_frames
 
 
 @dataclass(frozen=True)
@@ -167,12 +177,38 @@ def sign_features(
 def sign_pair_costs(
     a: SignFeatures, b: SignFeatures, config: SignAssociationConfig
 ) -> Float[Tensor, " p"]:
+    """The cost of linking each detection of `a` with the later one of `b` in the same row [px^2] (IV-A)."""
+    costs = _printed_costs if config.method == "paper2017" else _blended_costs
+    return costs(a, b, config)
+
+
+def _printed_costs(
+    a: SignFeatures, b: SignFeatures, config: SignAssociationConfig
+) -> Float[Tensor, " p"]:
+    """The epipolar cost as the paper prints it, summed over the best matching of vertices (IV-A, Cost for sign association).
+
+    Detections of different shapes have none: the paper does not say what the sum is where vertices are left over.
+    """
+    F_ab = fundamental(a.T_world_camera, b.T_world_camera)
+    cost = torch.full_like(a.focal, torch.inf)
+    kind = torch.where(a.shape == b.shape, polygon.corner_count(a.shape), 0)
+    for n in kind[kind > 0].unique().tolist():
+        at = (kind == n).nonzero()[:, 0]
+        p, q = a.corners[at, :n], b.corners[at, :n]
+        vertex = correspondence.vertex_costs(F_ab[at], p, q, components=3)
+        cost[at] = correspondence.free_assignment(vertex) * a.focal[at] * b.focal[at]
+    return cost
+
+
+def _blended_costs(
+    a: SignFeatures, b: SignFeatures, config: SignAssociationConfig
+) -> Float[Tensor, " p"]:
     """The epipolar cost of pairs of detections, mean over vertices [px^2] (IV-A, Cost for sign association).
 
     Vertices are matched in the best cyclic order; detections of different shapes are compared by their boxes. Where the
     baseline is too short to move a sign of typical size by more than the noise, the epipolar lines say nothing, and the
-    rotation-compensated pixel distance takes over. Unlike the paper, the cost is the mean and not the sum over
-    vertices, so that one threshold serves all shapes.
+    rotation-compensated pixel distance takes over. Unlike the paper, the norm is Sampson's, whose cost is a distance in
+    pixels wherever the epipolar line is, and the mean over vertices lets one threshold serve all shapes.
     """
     F_ab = fundamental(a.T_world_camera, b.T_world_camera)
     T_a_b = se3.inverse(a.T_world_camera) @ b.T_world_camera
@@ -196,8 +232,6 @@ def sign_pair_costs(
         vertex = share * correspondence.vertex_costs(F_ab[at], p, q) + moved
         if corners == 0:
             total = vertex.diagonal(dim1=-2, dim2=-1).sum(-1)
-        elif config.corner_matching == "free":
-            total = correspondence.free_assignment(vertex)
         else:
             total = correspondence.cyclic_sums(vertex).amin(-1)
         cost[at] = total * scale[at] / n

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.assignment import gated_matching
+from crowdmap_torch.clustering.assignment import gated_matching, matching_of_near
 from crowdmap_torch.geometry import depth_filter, polygon
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.tables import Journey, SignDetections, Tracklets
@@ -79,12 +79,15 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
             return rows, rows
         old = self.active
         silent_for = features.frame[rows[0]] - features.frame[old.last]
-        old = old[silent_for <= self.config.window_frames]
+        old = old[silent_for <= self.config.window]
         sighting, variance = features.sighting[rows], features.variance[rows]
         prediction = self._predict(old, features, int(rows[0]))
         epipolar_px2 = pair_costs(old.last[:, None], rows[None])
-        cost, gate = self._costs(old, features, rows, prediction, epipolar_px2)
-        row, column = gated_matching(cost, gate)
+        if self.config.method == "paper2017":
+            row, column = matching_of_near(epipolar_px2, self.config.paper.max_cost_px2)
+        else:
+            cost = self._costs(old, features, rows, prediction, epipolar_px2)
+            row, column = gated_matching(cost, self.config.unmatched_cost)
 
         label = self._labels(old, row, column, len(rows))
         shift = features.shift[rows]
@@ -147,8 +150,8 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         rows: Int[np.ndarray, " m"],
         prediction: depth_filter.Prediction,
         epipolar_px2: Float[np.ndarray, "n m"],
-    ) -> tuple[Float[np.ndarray, "n m"], float]:
-        """Cost of continuing each tracklet with each detection, and the cost of leaving both alone."""
+    ) -> Float[np.ndarray, "n m"]:
+        """Cost of continuing each tracklet with each detection."""
         c = self.config
         innovation = depth_filter.innovation(
             prediction, features.sighting[rows], features.variance[rows]
@@ -157,8 +160,6 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         other_shape = old.votes.argmax(-1)[:, None] != features.shape[rows]
         refused = innovation.distance_sq > c.max_distance**2
         refused |= (depth < c.min_depth_m) | (depth > c.max_depth_m)
-        if c.method == "epipolar":
-            return np.where(refused | other_shape, np.inf, epipolar_px2), c.max_epipolar_px**2
         # The poses' own noise moves the epipolar lines of near signs.
         pose_px2 = (features.focal[rows] / np.maximum(depth, c.min_depth_m)) ** 2
         epipolar = epipolar_px2 / (c.sigma_px**2 + pose_px2 * self._pose_variance)
@@ -174,7 +175,7 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         cost += c.shape_penalty * other_shape
         cost -= c.track_bonus * hinted
         cost[refused] = np.inf
-        return cost, c.unmatched_cost
+        return cost
 
 
 def _corner_order(
@@ -207,9 +208,7 @@ def associate_signs(
     detections = detections[order]
     features = sign_features(detections, journey.T_world_camera[detections.frame], config)
     pair_costs = partial(sign_pair_costs, config=config)
-    costs = window_costs(
-        features, pair_costs, window=config.window_frames, chunk=config.chunk_pairs
-    )
+    costs = window_costs(features, pair_costs, window=config.window, chunk=config.chunk_pairs)
     associator = SignAssociator(positioning, config)
     arrays = SignFeatureArrays.of(features.to("cpu"))
     label, shift = np.full(len(order), -1), np.zeros(len(order), dtype=np.int64)

@@ -9,7 +9,12 @@ import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from crowdmap_torch.clustering.assignment import gated_matching, match_slots, window_pairs
+from crowdmap_torch.clustering.assignment import (
+    gated_matching,
+    match_slots,
+    matching_of_near,
+    window_pairs,
+)
 
 
 def _best_by_enumeration(cost: torch.Tensor, gate: float) -> float:
@@ -43,9 +48,26 @@ def test_an_excellent_pair_is_not_given_up_for_two_poor_ones():
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0)])
-def test_empty_sides_match_nothing(shape):
-    row, column = gated_matching(np.zeros(shape), 1.0)
+@pytest.mark.parametrize("matching", [gated_matching, matching_of_near])
+def test_empty_sides_match_nothing(matching, shape):
+    row, column = matching(np.zeros(shape), 1.0)
     assert len(row) == len(column) == 0
+
+
+def test_the_gate_of_near_columns_leaves_their_partners_open():
+    # Column 1 is near row 0 only, which column 0 has; so it takes row 1, however dear. Column 2 is near no row.
+    cost = np.array([[0.1, 4.0, 9.0], [50.0, 30.0, 7.0]])
+    row, column = matching_of_near(cost, 5.0)
+    assert (row.tolist(), column.tolist()) == ([0, 1], [0, 1])
+
+
+def test_impossible_pairs_are_never_matched_and_a_match_is_not_given_up_for_one():
+    cost = np.array([[1.0, np.inf], [2.0, np.inf], [3.0, np.inf]])
+    row, column = matching_of_near(cost, 5.0)
+    assert (row.tolist(), column.tolist()) == ([0], [0])
+    cost = np.array([[1.0, 4.0], [np.inf, np.inf]])
+    row, column = matching_of_near(cost, 5.0)
+    assert (row.tolist(), column.tolist()) == ([0], [0])
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 1000])

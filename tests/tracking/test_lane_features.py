@@ -81,7 +81,7 @@ def test_one_line_from_two_places_costs_less_than_two_lines(method: str):
     later = features_at([1.75, -1.75], poses=poses[5:].expand(2, 4, 4), config=config)
     a, b = torch.tensor([0, 1, 0, 1]), torch.tensor([0, 1, 1, 0])
     cost = lane_pair_costs(first[a], later[b], config)
-    gate = config.unmatched_cost if method == "ground" else config.max_epipolar_px**2
+    gate = config.unmatched_cost if method == "ground" else config.paper.max_cost_px2
     assert cost[:2].max() < 0.1 * gate and cost[2:].min() > gate
 
 

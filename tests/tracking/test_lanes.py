@@ -74,19 +74,14 @@ def test_how_many_pairs_are_computed_at_once_changes_nothing(journey: Journey):
     assert torch.equal(few.label, associate_lanes(journey, config).label)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_car_that_stands_sees_the_same_markers_all_the_time(
-    journey: Journey, method: str, generator
-):
+def test_a_car_that_stands_sees_the_same_markers_all_the_time(journey: Journey, generator):
     frame = int(torch.bincount(journey.lanes.frame).argmax())
     standing = with_frames(journey, torch.full((30,), frame))
     noise = torch.randn(30, 6, generator=generator, dtype=torch.float64)
     # White noise of positions and rotations: 1.5 cm and 0.02 degrees.
     noise = noise * torch.tensor([0.015] * 3 + [3.5e-4] * 3, dtype=torch.float64)
     T = se3.retract(standing.T_world_camera, noise)
-    label = associate_lanes(
-        replace(standing, T_world_camera=T), LaneAssociationConfig(method=method)
-    ).label
+    label = associate_lanes(replace(standing, T_world_camera=T), LaneAssociationConfig()).label
     per_frame = label.reshape(30, -1)
     assert (per_frame == per_frame[0]).all()
     assert len(per_frame[0].unique()) == per_frame.shape[1]
