@@ -210,8 +210,10 @@ def canonical_with_shift(
     return T, size, (-turn * corners_per_turn // 8) % count
 
 
-def fit_template(corners_plane: Float[Tensor, "n 8 2"], shape: Int[Tensor, " n"]) -> TemplateFit:
-    """Rotation, size and cyclic shift with which shapes match corners best, upright ones preferred.
+def fit_template(
+    corners_plane: Float[Tensor, "n 8 2"], shape: Int[Tensor, " n"], *, shifts: int = MAX_CORNERS
+) -> TemplateFit:
+    """Rotation, size and cyclic shift, of the first `shifts`, with which shapes match corners best, upright ones preferred.
 
     Corners are centred on their mean, run clockwise in a plane with y up, and start anywhere. Each
     shift has its own least-squares rotation and size in closed form. Which shift is right shows in
@@ -225,7 +227,7 @@ def fit_template(corners_plane: Float[Tensor, "n 8 2"], shape: Int[Tensor, " n"]
     # column by column.
     moment = tau.square().sum(1)
     angles, sizes, errors, scores = [], [], [], []
-    for s in range(MAX_CORNERS):
+    for s in range(shifts):
         rolled = roll(corners_plane, torch.full_like(count, s), count)
         A = (rolled.mT @ tau) / moment[:, None, :]
         # R(angle) diag(w, h) nearest to A: the angle maximises a quadratic form in (cos, sin).
@@ -261,11 +263,13 @@ def fit_sign(
     corners_world: Float[Tensor, "n 8 3"],
     shape: Int[Tensor, " n"],
     toward_world: Float[Tensor, "n 3"],
+    *,
+    shifts: int = MAX_CORNERS,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n 2"], Int[Tensor, " n"]]:
     """T_world_sign, size [m] and cyclic shift of signs from corners almost in a plane (IV-B).
 
     Corners run clockwise as seen from the viewer and start anywhere; corner k of the sign is corner
-    `(k + shift) % C`. The normal is on the side of `toward_world`, a direction to the viewer.
+    `(k + shift) % C`, with a shift below `shifts`. The normal is on the side of `toward_world`, a direction to the viewer.
     """
     weight = corner_mask(shape).to(corners_world)
     centre, normal, _ = plane.fit_plane(corners_world, weight)
@@ -279,7 +283,7 @@ def fit_sign(
     y = torch.nn.functional.normalize(up - (up * z).sum(-1, keepdim=True) * z, dim=-1)
     T_world_plane = se3.make(torch.stack((torch.linalg.cross(y, z), y, z), dim=-1), centre)
     corners_plane = se3.transform(se3.inverse(T_world_plane)[:, None], corners_world)[..., :2]
-    fit = fit_template(corners_plane, shape)
+    fit = fit_template(corners_plane, shape, shifts=shifts)
     zero = torch.zeros_like(fit.angle)
     turn = torch.stack((zero, zero, zero, zero, zero, fit.angle), dim=-1)
     return se3.retract(T_world_plane, turn), fit.size, fit.shift

@@ -34,7 +34,6 @@ from crowdmap_torch.optim.linearize import residuals as rows_of_term
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.banded_schur import BandBackend
-from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, NormalEquations
 from crowdmap_torch.ranges import Deviations, RoundsOrNone, Settings, Share
 from crowdmap_torch.residuals.reprojection import (
@@ -74,9 +73,8 @@ class SignFitConfig(Settings):
     """How far the car holds that constraint on the drift."""
     tukey: Deviations = 2.8
     """Detections with a root mean square whitened error beyond this many standard deviations have no say."""
-    tukey_alone: Deviations = 20.0
-    """The same of signs fitted one by one, whose residuals hold the errors of the poses too: those move the nearest views
-    most, which tell most."""
+    tukey_alone: Deviations = 8.0
+    """Corners with a pixel error beyond this many standard deviations of their sign's have no say; method `paper2017`."""
     habit: SignHabit = field(default_factory=SignHabit)
     """What signs are like before anything is seen of them."""
     rounds: RoundsOrNone = 2
@@ -159,50 +157,6 @@ def fit_signs(
         positioning,
         config,
     )
-
-
-def fit_signs_alone(
-    views: SignViews,
-    shape: Int[Tensor, " n"],
-    start: SignStart,
-    facing: Float[Tensor, "n 3"],
-    drive: DrivePath,
-    positioning: PositioningNoise,
-    config: SignFitConfig,
-) -> SignFit:
-    """Signs one by one, the poses taken as they are: the paper's minimisation (IV-B).
-
-    What is wrong with the poses is in the residuals: the scale of Tukey's weights is that of each sign's own, from
-    those of the start on.
-    """
-    exact = replace(positioning, white_sigma_m=0.0, white_sigma_deg=0.0)
-    config = replace(config, tukey=config.tukey_alone)
-    nothing = start.size.new_zeros(len(views), 6)
-
-    def at(found: SignStart, scale: Tensor) -> tuple[Problem, dict[str, Tensor]]:
-        given = views.T_world_camera
-        noise = _noise(views, given, shape, found, nothing, scale, nothing[:, :2], exact, config)
-        return _problem(views, shape, found, noise, facing, config)
-
-    def spread(error_sq: Tensor) -> Tensor:
-        return robust_noise_scale(error_sq, views.sign, len(shape), torch.inf)
-
-    problem, values = at(start, torch.ones_like(start.size[:, 0]))
-    error_sq = _mean_square(_whitened(problem, values, shape, views), shape, views)
-    scale = spread(error_sq)
-    for _ in range(config.rounds):
-        problem, values = at(SignStart(values["sign"], values["size"]), scale)
-        values = lm.solve(problem, values, config.lm).values
-        error_sq = _mean_square(_whitened(problem, values, shape, views), shape, views)
-        scale = torch.minimum(scale, spread(error_sq * scale[views.sign].square()))
-    found = SignStart(values["sign"], values["size"])
-    frame = closest_approach(views, found, drive)
-    own = torch.arange(len(shape), device=shape.device)
-    centre = torch.eye(3, 6).to(start.size).expand(len(own), 3, 6)
-    normal = DenseBackend().assemble(problem, values)
-    of_centre = LinearFunctions((("sign", own),), (centre,))
-    covariance = held_covariance(normal.covariance().of(of_centre))
-    return SignFit(found.T_world_sign, found.size, frame, covariance, error_sq, 0.0)
 
 
 def fit_signs_coarsely(

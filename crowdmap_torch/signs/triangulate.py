@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -25,14 +26,9 @@ from crowdmap_torch.ranges import (
 )
 from crowdmap_torch.residuals.sign_prior import against_the_drive
 from crowdmap_torch.road.nonholonomic import DrivePath, drive_path
-from crowdmap_torch.signs.fit import SignFitConfig, fit_signs, fit_signs_alone
-from crowdmap_torch.signs.initialize import (
-    SignStartConfig,
-    centre_points,
-    choose_starts,
-    choose_starts_again,
-    starts,
-)
+from crowdmap_torch.signs.fit import SignFitConfig, fit_signs
+from crowdmap_torch.signs.fit_alone import center_axis_size, fit_signs_alone, mid_points
+from crowdmap_torch.signs.initialize import SignStartConfig, choose_starts, choose_starts_again
 from crowdmap_torch.signs.merge_tracks import RejoinConfig, rejoin, relabelled
 from crowdmap_torch.signs.views import SignFit, SignStart, SignViews, distance_away
 from crowdmap_torch.tables import Journey, Signs, Tracklets
@@ -60,18 +56,18 @@ class SignTriangulationConfig(Settings):
 
     method: str = "joint"
     """`joint`: all signs and the drift of the poses as one problem, several starts, fragments rejoined. `paper2017`: each
-    sign by itself from its best plane, poses taken as they are."""
+    sign by itself (`signs.fit_alone`), kept where its views see it from different enough angles."""
     min_frames: Count = 3
     """Tracklets with fewer detections of the tracklet's shape are pruned."""
-    min_parallax_deg: Degrees = 0.7
-    """`joint`: tracklets whose rays differ by less are pruned."""
     min_parallax_alone_deg: Degrees = 10.0
-    """`paper2017`: the same of signs fitted one by one, which what drifts between the views moves the further the less their
-    rays differ."""
+    """`paper2017`: tracklets whose rays differ by less are pruned; what drifts between the views moves signs fitted one by
+    one the further the less they differ."""
+    min_parallax_deg: Degrees = 0.7
+    """`joint`, as all that follows: tracklets whose rays differ by less are pruned."""
     max_distance_m: Length = 80.0
     """Tracklets whose closest view is further away are pruned."""
     max_noise_scale: Deviations = 3.9
-    """`joint`: tracklets whose views are noisier, as a multiple of the noise expected, are pruned."""
+    """Tracklets whose views are noisier, as a multiple of the noise expected, are pruned."""
     min_inlier_share: Share = 0.5
     """Tracklets of whose views fewer agree with the sign are pruned."""
     max_sigma_m: Sigma = 1.5
@@ -81,17 +77,17 @@ class SignTriangulationConfig(Settings):
     max_doubtful_sigma_m: Sigma = 0.5
     """Largest standard deviation of those."""
     size_m: Span = (0.1, 16.5)
-    """Smallest and largest plausible width and height: a board above four lanes of 3.75 m is 15 m wide, and what is found
-    of it may be a tenth more."""
+    """Of both methods: smallest and largest plausible width and height. A board above four lanes of 3.75 m is 15 m wide, and
+    what is found of it may be a tenth more."""
     min_side_m: Length = 0.25
     """Smallest plausible larger side: false detections that slide through the image of a creeping car look like tiny
     plates before the lens."""
     confident_frames: Factor = 4.0
     """Views in agreement, weighted by their scores, at which the confidence reaches 1 - 1/e."""
     start: SignStartConfig = field(default_factory=SignStartConfig)
-    """`joint`: where the fits begin."""
+    """Where the fits begin."""
     rejoin: RejoinConfig = field(default_factory=RejoinConfig)
-    """`joint`: when tracklets are put together again after a gap."""
+    """When tracklets are put together again after a gap."""
     fit: SignFitConfig = field(default_factory=SignFitConfig)
     """The minimisation."""
 
@@ -142,12 +138,16 @@ def triangulate_signs(
     label, sign = tracklets.label[rows].unique(return_inverse=True)
     seen = _Seen(tracklets, label, rows, views_of(journey, tracklets, rows, sign))
     drive = drive_path(journey, positioning, config.fit.nonholonomic, config.fit.drift)
-    fit_method = _fit_alone if config.method == "paper2017" else _fit_jointly
+    is_alone = config.method == "paper2017"
+    fit_method = _fit_alone if is_alone else _fit_jointly
     fitted = fit_method(journey, seen, shape, drive, positioning, config)
     seen, fit = fitted.seen, fitted.fit
     label, views = seen.label, seen.views
     reason[fitted.rejoined] = REJOINED
-    fate = _fates(views, fit, fitted.noise_scale, config)
+    if is_alone:
+        fate = _fates_alone(views, fit, config)
+    else:
+        fate = _fates(views, fit, fitted.noise_scale, config)
     reason[label] = fate
     kept = fate == KEPT
     signs, turn = _signs(journey, seen.rows, views, fit, shape[label], label, config)
@@ -230,11 +230,8 @@ def _fit_alone(
     config: SignTriangulationConfig,
 ) -> _Fitted:
     label, views = seen.label, seen.views
-    centre = centre_points(views, len(label), typical_height_m=config.fit.habit.typical_size_m)
-    # The last is the best plane through the mid-points of the corners, or an upright sign where they have none.
-    best = starts(views, shape[label], centre, yaws=(0.0,), size_limits=config.size_m)[-1]
-    facing = against_the_drive(views.T_world_camera, views.sign, len(label))
-    fit = fit_signs_alone(views, shape[label], best, facing, drive, positioning, config.fit)
+    start = center_axis_size(mid_points(views, len(label)), shape[label], views)
+    fit = fit_signs_alone(views, shape[label], start, drive, config.fit)
     return _Fitted(seen, label[:0], fit, torch.ones_like(fit.size[:, 0]))
 
 
@@ -294,22 +291,16 @@ def _fates(
     """Whether each sign is kept, or why it is pruned; the first reason counts."""
     n = len(scale)
     away = distance_away(views, fit)
-    in_camera = se3.transform(
-        se3.inverse(views.T_world_camera), fit.T_world_sign[views.sign, :3, 3]
-    )
-    is_behind = (in_camera[:, 2] <= 0).to(scale)
     agrees = (fit.error_sq < config.fit.tukey**2).to(scale)
     number = group_sum(torch.ones_like(agrees), views.sign, n)
     sigma = torch.linalg.eigvalsh(fit.covariance)[:, -1].clamp_min(0).sqrt()
     agreeing = group_sum(agrees, views.sign, n)
     is_doubtful = agreeing < config.doubtful_frames
     doubtful = min(config.max_doubtful_sigma_m, config.max_sigma_m)
-    is_alone = config.method == "paper2017"
-    parallax_deg = config.min_parallax_alone_deg if is_alone else config.min_parallax_deg
     low, high = config.size_m
     tests = (
-        (BEHIND, group_sum(is_behind, views.sign, n) > 0),
-        (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(parallax_deg)),
+        (BEHIND, _is_behind(views, fit)),
+        (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(config.min_parallax_deg)),
         (TOO_FAR, away[group_argmin(away, views.sign)] > config.max_distance_m),
         (SIZE, ((fit.size < low) | (fit.size > high)).any(-1)),
         (SIZE, fit.size.amax(-1) < config.min_side_m),
@@ -318,10 +309,34 @@ def _fates(
         (RESIDUAL, scale > config.max_noise_scale),
         (UNCERTAIN, ~(sigma < torch.where(is_doubtful, doubtful, config.max_sigma_m))),
     )
-    fate = torch.full_like(views.sign[:1].expand(n), KEPT).clone()
+    return _first_reason(tests)
+
+
+def _fates_alone(
+    views: SignViews, fit: SignFit, config: SignTriangulationConfig
+) -> Int[Tensor, " n"]:
+    """As `_fates`, by the angles that signs are seen at, and of what can be no sign."""
+    every = torch.ones_like(views.sign, dtype=torch.bool)
+    narrow = _parallax(views, fit, every) < math.radians(config.min_parallax_alone_deg)
+    low, high = config.size_m
+    no_sign = ((fit.size < low) | (fit.size > high)).any(-1)
+    return _first_reason(((BEHIND, _is_behind(views, fit)), (NO_PARALLAX, narrow), (SIZE, no_sign)))
+
+
+def _first_reason(tests: Sequence[tuple[int, Bool[Tensor, " n"]]]) -> Int[Tensor, " n"]:
+    """The code of the first test that each sign fails."""
+    fate = torch.full_like(tests[0][1], KEPT, dtype=torch.int64)
     for code, fails in tests:
         fate = torch.where((fate == KEPT) & fails, code, fate)
     return fate
+
+
+def _is_behind(views: SignViews, fit: SignFit) -> Bool[Tensor, " n"]:
+    """True for signs that are behind one of the cameras that saw them, or nowhere."""
+    centre = fit.T_world_sign[views.sign, :3, 3]
+    in_camera = se3.transform(se3.inverse(views.T_world_camera), centre)
+    is_behind = ~(in_camera[:, 2] > 0)
+    return group_sum(is_behind.to(fit.size), views.sign, len(fit.size)) > 0
 
 
 def _parallax(views: SignViews, fit: SignFit, counts: Bool[Tensor, " m"]) -> Float[Tensor, " n"]:

@@ -16,10 +16,10 @@ from crowdmap_torch.road.nonholonomic import DrivePath, drive_path
 from crowdmap_torch.signs.fit import (
     SignFitConfig,
     fit_signs,
-    fit_signs_alone,
     fit_signs_coarsely,
     robust_noise_scale,
 )
+from crowdmap_torch.signs.fit_alone import fit_signs_alone
 from crowdmap_torch.signs.views import SignFit, SignStart, SignViews
 
 NOISE = PositioningNoise()
@@ -165,7 +165,7 @@ def test_signs_fitted_alone_are_exact_where_poses_are(generator):
     drive = drive_past(straight_poses(60), signs_at(centers, yaw_deg=10.0), shape=list(range(6)))
     path = path_of(drive.journey.T_world_camera)
     start, views = start_of(drive, generator), views_of(drive)
-    found = fit_signs_alone(views, drive.shape, start, facing(6), path, NOISE, CONFIG)
+    found = fit_signs_alone(views, drive.shape, start, path, CONFIG)
     error = se3.transform(found.T_world_sign[:, None], polygon.corners(drive.shape, found.size))
     assert float((error - drive.corners_world).norm(dim=-1).max()) < 0.005
 
@@ -178,7 +178,7 @@ def test_signs_fitted_alone_take_drift_for_parallax(generator):
     views = views_of(drive)
     views = replace(views, T_world_camera=poses[views.frame])
     start = start_of(drive, generator, push=0.02)
-    found = fit_signs_alone(views, drive.shape, start, facing(1), path_of(poses), NOISE, CONFIG)
+    found = fit_signs_alone(views, drive.shape, start, path_of(poses), CONFIG)
     assert found.T_world_sign[0, 1, 3] - drive.T_world_sign[0, 1, 3] == pytest.approx(0.6, abs=0.1)
 
 
@@ -186,9 +186,9 @@ def test_signs_fitted_alone_have_no_gross_outliers(generator):
     drive = drive_past(straight_poses(60), signs_at([(3.5, 60.0, 2.5)]), noise_px=0.3)
     views, path = views_of(drive), path_of(drive.journey.T_world_camera)
     start = start_of(drive, generator, push=0.02)
-    clean = fit_signs_alone(views, drive.shape, start, facing(1), path, NOISE, CONFIG)
+    clean = fit_signs_alone(views, drive.shape, start, path, CONFIG)
     bad = pushed(views, 40.0)
-    robust = fit_signs_alone(bad, drive.shape, start, facing(1), path, NOISE, CONFIG)
+    robust = fit_signs_alone(bad, drive.shape, start, path, CONFIG)
     offset = robust.T_world_sign[:, :3, 3] - clean.T_world_sign[:, :3, 3]
     # A tenth of the views are missing: less than a fifth of the standard deviation.
     assert float(offset.norm()) < 0.2 * float(clean.covariance[0].trace().sqrt())
