@@ -8,7 +8,7 @@ eigenpairs only, and a large one with more clusters than those can tell is first
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -135,20 +135,23 @@ def cluster_graph(
     config: SpectralConfig,
     *,
     generator: torch.Generator | None = None,
+    whole: Int[Tensor, " n"] | None = None,
 ) -> SpectralClusters:
     """Clusters of the `n` nodes of a graph with symmetric similarities in (0, 1] on its edges (V-A).
 
     Each pair of nodes may appear once, in either order; a node is similar to itself by 1. Edges of similarity zero are
-    no edges. The number of clusters of each connected component comes from the gap of its own eigenvalues.
+    no edges. The number of clusters of each connected component comes from the gap of its own eigenvalues; or, with
+    `whole`, from the one gap of all components whose nodes have the same number there, 0 and up, as it does where a
+    matrix that falls into blocks is decomposed as one.
     """
     graph = symmetric_graph(edge, similarity, n)
     piece = connected_components(graph.row, graph.column, n)
-    found = _Found(n)
-    piece, pieces = _label_large(graph, piece, found, config, generator)
-    _label_small(graph, piece, pieces, found, config, generator)
-    label = renumber(found.label)
-    spectra = found.spectra
-    eigenvalues = torch.cat(spectra).sort().values if spectra else similarity.new_zeros(0)
+    piece, pieces, large = _decompose_large(graph, piece, config)
+    found = [*large, *_decompose_small(graph, piece, pieces, config)]
+    if whole is not None:
+        found = _counted_together(found, whole.cpu())
+    label = _labels_of(found, n, config, generator)
+    eigenvalues = torch.cat([similarity[:0].cpu(), *(p.eigenvalues for p in found)]).sort().values
     return SpectralClusters(
         label=label.to(edge.device),
         count=int(label.max()) + 1 if n else 0,
@@ -179,32 +182,55 @@ def _labels(
     return kmeans_labels(vectors, restarts=config.restarts, generator=generator)
 
 
-class _Found:
-    """Labels as they are found, piece by piece, on the CPU, and the spectra they were read from."""
+@dataclass(frozen=True)
+class _Piece:
+    """A piece of a graph that was decomposed as one, on the CPU."""
 
-    def __init__(self, n: int) -> None:
-        self.label = torch.zeros(n, dtype=torch.int64)
-        self.spectra: list[Float[Tensor, " _"]] = []
-        self._free = 0
-
-    def add(self, nodes: Int[Tensor, " k"], own: Int[Tensor, " k"]) -> None:
-        """The labels 0, 1, ... of one piece's nodes."""
-        self.label[nodes] = self._free + own
-        self._free += int(own.max()) + 1
+    nodes: Int[Tensor, " m"]
+    eigenvalues: Float[Tensor, " k"]
+    """Ascending."""
+    vectors: Float[Tensor, "m l"]
+    count: int
+    """Clusters in it, by its own gap."""
 
 
-def _label_large(
-    graph: Graph,
-    piece: Int[Tensor, " n"],
-    found: _Found,
-    config: SpectralConfig,
-    generator: torch.Generator | None,
-) -> tuple[Int[Tensor, " n"], int]:
-    """Labels the large components by their leading eigenpairs; the pieces that are left after cuts, and their number."""
+def _counted_together(pieces: list[_Piece], whole: Int[Tensor, " n"]) -> list[_Piece]:
+    """The pieces with as many clusters each as it has eigenvalues below the gap in those of its whole."""
+    of = [int(whole[piece.nodes[0]]) for piece in pieces]
+    below = {}
+    for number in set(of):
+        of_whole = [p.eigenvalues for p, w in zip(pieces, of, strict=True) if w == number]
+        values = torch.cat(of_whole).sort().values
+        below[number] = values[eigengap(values, torch.tensor(len(values))) - 1]
+    counted = []
+    for piece, number in zip(pieces, of, strict=True):
+        # The null vector of a piece is of its own: no piece is less than one cluster. Of a large one few are known.
+        count = max(int((piece.eigenvalues <= below[number]).sum()), 1)
+        counted.append(replace(piece, count=min(count, piece.vectors.shape[1])))
+    return counted
+
+
+def _labels_of(
+    pieces: list[_Piece], n: int, config: SpectralConfig, generator: torch.Generator | None
+) -> Int[Tensor, " n"]:
+    """Clusters of all pieces, numbered by their first node."""
+    label, free = torch.zeros(n, dtype=torch.int64), 0
+    for piece in pieces:
+        own = _labels(piece.vectors[:, : piece.count], config, generator)
+        label[piece.nodes] = free + own
+        free += int(own.max()) + 1
+    return renumber(label)
+
+
+def _decompose_large(
+    graph: Graph, piece: Int[Tensor, " n"], config: SpectralConfig
+) -> tuple[Int[Tensor, " n"], int, list[_Piece]]:
+    """The pieces of all nodes after cuts of large components, their number, and the leading eigenpairs of the large ones."""
     piece, most = piece.clone(), config.whole_limit
     size = torch.bincount(piece)
     pieces = len(size)
     large = list(parts(graph, renumber(piece.masked_fill(size[piece] <= most, -1))))
+    found = []
     while large:
         part = large.pop()
         pairs = leading_eigenpairs(part, config.leading, crowded_below=config.cut_below)
@@ -215,20 +241,15 @@ def _label_large(
                 if half.size > most:
                     large.append(half)
             continue
-        found.spectra.append(pairs.values.cpu())
-        found.add(part.node.cpu(), _labels(pairs.vectors.cpu(), config, generator))
-    return piece, pieces
+        vectors = pairs.vectors.cpu()
+        found.append(_Piece(part.node.cpu(), pairs.values.cpu(), vectors, vectors.shape[1]))
+    return piece, pieces, found
 
 
-def _label_small(
-    graph: Graph,
-    piece: Int[Tensor, " n"],
-    pieces: int,
-    found: _Found,
-    config: SpectralConfig,
-    generator: torch.Generator | None,
-) -> None:
-    """Labels the small pieces, in batches of like size."""
+def _decompose_small(
+    graph: Graph, piece: Int[Tensor, " n"], pieces: int, config: SpectralConfig
+) -> Iterator[_Piece]:
+    """The small pieces, decomposed whole in batches of like size."""
     sizes = torch.bincount(piece, minlength=pieces)
     # A number that was cut up has no nodes left.
     small = torch.nonzero((sizes > 0) & (sizes <= config.whole_limit))[:, 0]
@@ -242,11 +263,9 @@ def _label_small(
         laplacian, own = batches.laplacians(start, stop)
         values, vectors = torch.linalg.eigh(laplacian)
         counts = eigengap(values, own).tolist()
-        found.spectra.append(values[values < 0.5 * (_PADDING + 2)].cpu())
-        vectors = vectors.cpu()
+        values, vectors = values.cpu(), vectors.cpu()
         for b, (n, count) in enumerate(zip(size[start:stop], counts, strict=True)):
-            label = _labels(vectors[b, :n, :count], config, generator)
-            found.add(node[first : first + n], label)
+            yield _Piece(node[first : first + n], values[b, :n], vectors[b, :n, :n], count)
             first += n
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import torch
@@ -25,6 +25,8 @@ from crowdmap_torch.tables import ControlPoints, Lanes
 SIMILARITIES = ("gaussian", "ratio")
 
 _POINTS_AT_ONCE = 8192
+_DENSE = 4096
+"""Most nodes of a component whose spectrum is computed whole."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +94,15 @@ def cluster_lanes(
     """
     label = torch.arange(len(lanes), device=lanes.journey.device)
     packed = lanes.select(label)
+    spectral = replace(config.spectral, whole_limit=_DENSE)
     control, count = packed.control.point_world, packed.control_count
     rounds = []
     for critical in config.critical_m:
         edge, similarity = lane_similarity(control, count, config, critical=critical)
-        found = cluster_graph(edge, similarity, len(count), config.spectral, generator=generator)
+        one = torch.zeros_like(count)
+        found = cluster_graph(
+            edge, similarity, len(count), spectral, generator=generator, whole=one
+        )
         rounds.append(LaneRound(len(count), found.count, found.eigenvalues))
         stands_still = found.count == len(count)
         label = found.label[label]
@@ -127,7 +133,8 @@ def lane_similarity(
     number = torch.bincount(owner, minlength=len(count))
     edge, near, closest = alongside(point, owner, len(count), config.radius_m)
     own = edge[:, 0] == edge[:, 1]
-    share = near / (number[edge[:, 0]] * number[edge[:, 1]])  # the paper's N
+    # The paper's N; whole numbers would be divided in single precision.
+    share = near.to(closest) / (number[edge[:, 0]] * number[edge[:, 1]])
     if config.similarity == "gaussian":
         similarity = (-0.5 * (closest / (critical * share)).square()).exp()
     else:

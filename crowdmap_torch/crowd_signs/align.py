@@ -172,24 +172,26 @@ def align_journeys(
     `station` [m] is the distance driven to where each sign was closest; `start` the bias known so far; `bias_sigma` [m]
     its prior; `journey_weight` and the `certainty` of each sign being in the right cluster are 0 to 1. What all
     journeys share cannot be seen: the mean of the biases, weighted by their priors, is zero. Unlike the paper, the
-    bias drifts along the journey and turns with it, and outliers have no say.
+    bias drifts along the journey and turns with it, and outliers have no say; `paper2017`: `mean_differences`.
     """
     journeys = len(start)
     if bias_sigma is None:
         bias_sigma = station.new_tensor(positioning.bias_sigma_m).expand(journeys, 3)
     weight = station.new_ones(journeys) if journey_weight is None else journey_weight
+    gauge = (1e-6 + weight)[:, None] / bias_sigma.square()
+    shared = torch.diag(1 / gauge.sum(0))
+    if config.method == "paper2017":
+        bias = mean_differences(signs, label, station, start)
+        return replace(bias, shared_covariance=shared)
     used = _in_shared_clusters(signs.journey, label)
     members, label, station = signs[used], label[used], station[used]
     covariance = members.covariance + config.noise_sigma_m**2 * torch.eye(3).to(station)
-    if config.method == "paper2017":
-        covariance = torch.eye(3).to(station).expand_as(covariance)
     information = torch.linalg.inv(covariance)
     if certainty is not None:
         sure = certainty[used].clamp_min(config.least_certainty)
         information = information * sure[:, None, None]
     # A journey without weight has no say in the places of the clusters, yet its own bias is found from them.
     say = weight[members.journey].clamp_min(1e-6)[:, None, None]
-    gauge = (1e-6 + weight)[:, None] / bias_sigma.square()
     component = _connected_journeys(members.journey, label, journeys)
     clusters = int(label.max()) + 1 if len(label) else 0
 
@@ -200,28 +202,43 @@ def align_journeys(
     )
     for _ in range(config.sweeps):
         corrected = measured - bias_at(bias, members.journey, station, measured)
-        trusted = information
-        if config.method == "robust":
-            squared = mahalanobis(corrected - place[label], covariance)
-            # Before the biases are found everything misses: the scale starts wide and narrows by itself.
-            scale = (squared.median() / _CHI_SQUARE_MEDIAN).clamp_min(1)
-            trust = Tukey().weight(squared / scale)
-            trusted = information * trust.clamp_min(1e-4)[:, None, None]
+        squared = mahalanobis(corrected - place[label], covariance)
+        # Before the biases are found everything misses: the scale starts wide and narrows by itself.
+        scale = (squared.median() / _CHI_SQUARE_MEDIAN).clamp_min(1)
+        trust = Tukey().weight(squared / scale)
+        trusted = information * trust.clamp_min(1e-4)[:, None, None]
         place = _places(corrected, say * trusted, label, clusters)
         before = bias
-        if config.method == "paper2017":
-            bias = _mean_difference(bias, members, place[label])
-        else:
-            bias = _bias_given_places(
-                bias, members, station, place[label], trusted, bias_sigma, positioning
-            )
+        bias = _bias_given_places(
+            bias, members, station, place[label], trusted, bias_sigma, positioning
+        )
         shift = group_sum(gauge * bias.translation, component, journeys)
         mean = shift / group_sum(gauge, component, journeys).clamp_min(1e-300)
         bias = replace(bias, translation=bias.translation - mean[component])
         if _largest_change(bias, before) < _STANDS_STILL_M:
             break
-    total = gauge.sum(0)
-    return replace(bias, shared_covariance=torch.diag(1 / total))
+    return replace(bias, shared_covariance=shared)
+
+
+def mean_differences(
+    signs: Signs, label: Int[Tensor, " n"], station: Float[Tensor, " n"], start: JourneyBias
+) -> JourneyBias:
+    """The paper's bias of each journey (V-B): the mean difference of its reconstructions from everybody's mean.
+
+    Everybody's mean of a cluster is that of its members with the biases of `start` taken off; those are zero where the
+    paper is followed.
+    """
+    used = _in_shared_clusters(signs.journey, label)
+    members, label, station = signs[used], label[used], station[used]
+    measured = members.center_world
+    clusters = int(label.max()) + 1 if len(label) else 0
+    total = group_sum(
+        measured - bias_at(start, members.journey, station, measured), label, clusters
+    )
+    place = total / group_count(label, clusters).clamp_min(1)[:, None]
+    difference = group_sum(measured - place[label], members.journey, len(start))
+    number = group_count(members.journey, len(start)).clamp_min(1)
+    return replace(start, translation=difference / number[:, None])
 
 
 def _largest_change(bias: JourneyBias, before: JourneyBias) -> float:
@@ -241,13 +258,6 @@ def _places(
     empty = group_count(label, clusters) == 0
     total[empty] = torch.eye(3).to(total)
     return torch.linalg.solve(total, right)
-
-
-def _mean_difference(bias: JourneyBias, members: Signs, place: Float[Tensor, "n 3"]) -> JourneyBias:
-    """The paper's bias: the mean difference between a journey's reconstructions and everybody's."""
-    total = group_sum(members.center_world - place, members.journey, len(bias))
-    number = group_count(members.journey, len(bias)).clamp_min(1)
-    return replace(bias, translation=total / number[:, None])
 
 
 def _bias_given_places(

@@ -18,7 +18,7 @@ from crowdmap_torch.clustering.groups import (
     group_mode,
     group_sum,
 )
-from crowdmap_torch.clustering.neighbours import near_pairs
+from crowdmap_torch.clustering.neighbours import near_pairs, pairs_in_radius
 from crowdmap_torch.clustering.spectral import SpectralConfig, cluster_graph, renumber
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, mahalanobis, sign_distance
 from crowdmap_torch.geometry import polygon, se3
@@ -27,6 +27,9 @@ from crowdmap_torch.ranges import FILLED, Count, Deviations, Length, Settings
 from crowdmap_torch.tables import Signs
 
 METHODS = ("joint", "paper2017")
+
+_DENSE = 4096
+"""Most nodes of a component whose spectrum the paper's rounds compute whole."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +44,8 @@ class SignClusterConfig(Settings):
     """`joint`: critical distance d_c in standard deviations."""
     reach: Deviations = 4.0
     """Similarities beyond this many d_c are taken for zero."""
-    neighbours_paper: Count = 256
-    """`paper2017`: nearest neighbours of a sign in the graph; enough for all within reach but in the densest places."""
+    reach_paper: Deviations = 6.0
+    """`paper2017`: the same; they are 1.5e-8 there."""
     neighbours: Count = 48
     """`joint`: nearest neighbours of a sign in the graph."""
     min_signs: Count = 2
@@ -92,8 +95,8 @@ def cluster_signs(
     """Groups of signs of different journeys that are one physical sign, from places as they are (V-A.1).
 
     `shift_sigma` [m], east north up, is how uncertain the journeys' shifts still are (`joint` only; default 0.3 m).
-    Unlike the paper, the graph holds the nearest neighbours of each sign only, and each of its connected components has
-    its own eigenvalue gap; with `joint`, distance is in standard deviations and differences of appearance add to it.
+    Unlike the paper, with `joint` the graph holds the nearest neighbours of each sign only, each of its connected
+    components has its own eigenvalue gap, distance is in standard deviations and differences of appearance add to it.
     """
     if config.method == "paper2017":
         return _cluster_paper(signs, config, generator)
@@ -106,22 +109,33 @@ def _cluster_paper(
 ) -> SignClusters:
     label = torch.zeros_like(signs.journey)
     spectra = []
+    spectral = replace(config.spectral, whole_limit=_DENSE)
     for scale in config.scales_m:
-        edge = near_pairs(
-            signs.center_world, radius=config.reach * scale, count=config.neighbours_paper
+        edge = pairs_in_radius(signs.center_world, config.reach_paper * scale)
+        i, j = edge.T
+        # A round only divides the clusters of the one before.
+        edge = edge[label[i] == label[j]]
+        similarity = center_similarity(signs, edge, critical_m=scale)
+        # One number of clusters for all signs, then one for those of each cluster.
+        found = cluster_graph(
+            edge, similarity, len(signs), spectral, generator=generator, whole=label
         )
-        i, j = edge.T
-        # Triangulations of one journey are taken for distinct, and so are those of different shapes; a round only
-        # divides the clusters of the one before.
-        distinct = (signs.journey[i] == signs.journey[j]) | (signs.shape[i] != signs.shape[j])
-        edge = edge[~distinct & (label[i] == label[j])]
-        i, j = edge.T
-        distance = (signs.center_world[i] - signs.center_world[j]).norm(dim=1)
-        similarity = torch.exp(-0.5 * (distance / scale).square())
-        found = cluster_graph(edge, similarity, len(signs), config.spectral, generator=generator)
         label = found.label
         spectra.append(Spectrum(scale, found.eigenvalues, found.count))
     return _without_small(label, tuple(spectra), config)
+
+
+def center_similarity(
+    signs: Signs, edge: Int[Tensor, "m 2"], *, critical_m: float
+) -> Float[Tensor, " m"]:
+    """The paper's similarity of pairs of signs (V-A.1, eq:simsign), `critical_m` its d_c.
+
+    Zero for triangulations of one journey, which are taken for distinct, and for those of different shapes.
+    """
+    i, j = edge.T
+    distance = (signs.center_world[i] - signs.center_world[j]).norm(dim=1)
+    distinct = (signs.journey[i] == signs.journey[j]) | (signs.shape[i] != signs.shape[j])
+    return torch.exp(-0.5 * (distance / critical_m).square()).masked_fill(distinct, 0.0)
 
 
 def _cluster_joint(
