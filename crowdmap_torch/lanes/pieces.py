@@ -161,26 +161,20 @@ def fit_pieces(
     *,
     smoothing: float,
     scales: tuple[float, ...],
-    refine: bool = False,
 ) -> LaneFit:
     """Splines by iterated least squares (Tukey), all pieces at once.
 
     `sigma` is the lateral noise expected of each point [m]; `scales` are factors on it, one an
-    iteration. `smoothing` is the price of bending in units of a piece's whole weight. `refine`
-    moves points once to the parameter nearest to them, which only pieces without a known parameter
-    need.
+    iteration, with none of them all points count alike. `smoothing` is the price of bending in units of a piece's whole
+    weight.
     """
     count, piece = pieces.control_count, pieces.piece
     point, expected = point_world[pieces.point], sigma[pieces.point]
     own = expected.square().reciprocal()
-    kept, t = torch.ones_like(own), pieces.t
-    base = _Basis(t, piece, count)
+    kept = torch.ones_like(own)
+    base = _Basis(pieces.t, piece, count)
     coefficient = base.solve(point, own, smoothing)
-    for step, scale in enumerate(scales):
-        if refine and step == len(scales) - 1:
-            control = spline_basis.from_coefficients_flat(coefficient, count)
-            t = spline_fit.closest_parameter_flat(control, count, point, piece)
-            base = _Basis(t, piece, count)
+    for scale in scales:
         whitened = base.miss(coefficient, point) / expected
         noise = _group_median(whitened.abs(), piece, len(count)) * 1.4826
         gate = scale * noise.clamp(0.5, 4.0)[piece]

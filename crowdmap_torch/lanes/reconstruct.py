@@ -51,12 +51,18 @@ KEPT, FEW_FRAMES, NO_POINTS, SHORT, UNCERTAIN = range(len(REASONS))
 
 @dataclass(frozen=True)
 class PaperPieces(Settings):
-    """The pieces of the paper (IV-D)."""
+    """The pieces of the paper (IV-D), and what it leaves open of them."""
 
+    min_frames: Count = 4
+    """Tracklets with fewer detections are pruned."""
     recent_points: Count = 200
     """Points of a piece; a new piece begins after half of them."""
+    control_points: Annotated[int, Range(2, 1000, "a spline has two ends")] = 5
+    """Of every piece; fewer points than that make no piece."""
     range_m: Span = (2.0, 45.0)
     """Depth of the points that are used."""
+    sigma_m: Sigma = 0.2
+    """1-sigma of a point across its marker: for the covariances, all points weigh alike."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +72,16 @@ class LaneConfig(Settings):
     method: str = "surface"
     """`surface`: points on the road that the car drove; `paper2017`: points on one plane a frame,
     most recent points."""
+    paper: PaperPieces = field(default_factory=PaperPieces)
+    """Method `paper2017`."""
+    confident_frames: Factor = 4.0
+    """Detections that a piece needs for its confidence to reach 1 - 1/e."""
+    sigma_m: Sigma = 0.04
+    """1-sigma of a piece's lateral error that its points share."""
+    height_sigma: Sigma = 0.015
+    """1-sigma of the camera height, as a share of it: offsets are off by the same share."""
     min_frames: Count = 4
-    """Tracklets with fewer detections are pruned."""
+    """Tracklets with fewer detections are pruned; method `surface`, as all that follows."""
     min_length_m: Length = 4.0
     """Pieces that are shorter are pruned."""
     min_points: Count = 12
@@ -75,7 +89,7 @@ class LaneConfig(Settings):
     max_sigma_m: Sigma = 1.0
     """Pieces whose control points are less sure, in the mean, are pruned."""
     range_m: Span = (2.0, 25.0)
-    """Depth of the points that are used; method `surface`."""
+    """Depth of the points that are used."""
     piece_m: Spacing = 40.0
     """Length of a piece."""
     overlap: Annotated[float, Range(0, 0.89, "a share: with more, pieces hardly move on")] = 0.5
@@ -91,18 +105,10 @@ class LaneConfig(Settings):
     """1-sigma of the normal's error that changes from frame to frame [rad]."""
     drift: Sigma = 0.01
     """Drift of the car's reckoned way over one metre [m]; with the square root of the way."""
-    sigma_m: Sigma = 0.04
-    """1-sigma of a piece's lateral error that its points share."""
-    height_sigma: Sigma = 0.015
-    """1-sigma of the camera height, as a share of it: offsets are off by the same share."""
     smoothing: Factor = 1e-4
     """Price of bending, in units of a piece's whole weight."""
     scales: Annotated[tuple[Factor, ...], FILLED] = (8.0, 4.0, 2.0, 1.0)
     """Factors on the noise in iterated least squares (Tukey), coarse to fine."""
-    confident_frames: Factor = 4.0
-    """Detections that a piece needs for its confidence to reach 1 - 1/e."""
-    paper: PaperPieces = field(default_factory=PaperPieces)
-    """Method `paper2017`."""
 
     def __post_init__(self) -> None:
         """Refuses unknown methods."""
@@ -138,9 +144,10 @@ def reconstruct_lanes(
     """The lane pieces that a journey's tracklets show (the paper's O2), and what was pruned."""
     label = tracklets.label
     frames = torch.bincount(label[label >= 0], minlength=tracklets.count)
-    reason = torch.where(frames < config.min_frames, FEW_FRAMES, NO_POINTS)
-    is_long = torch.nn.functional.pad(reason == NO_POINTS, (0, 1))  # the last one for no tracklet
     is_paper = config.method == "paper2017"
+    min_frames = config.paper.min_frames if is_paper else config.min_frames
+    reason = torch.where(frames < min_frames, FEW_FRAMES, NO_POINTS)
+    is_long = torch.nn.functional.pad(reason == NO_POINTS, (0, 1))  # the last one for no tracklet
     ground = (project_to_planes if is_paper else project_to_surface)(journey, road)
     near, far = config.paper.range_m if is_paper else config.range_m
     detection = journey.lane_points.detection
@@ -148,18 +155,17 @@ def reconstruct_lanes(
     rows = (used & (ground.depth > near) & (ground.depth < far)).nonzero()[:, 0]
     ground, detection = ground[rows], detection[rows]
     frame, marker = journey.lanes.frame[detection], label[detection]
-    pieces, sigma = _cut(journey, ground, frame, marker, road, config)
-    pieces = pieces.select(torch.bincount(pieces.piece, minlength=len(pieces)) >= config.min_points)
-    fit = fit_pieces(
-        pieces,
-        ground.point_world,
-        sigma,
-        smoothing=config.smoothing,
-        scales=config.scales,
-        refine=is_paper,
-    )
+    if is_paper:
+        pieces, fit = _papers_pieces(ground, frame, marker, config.paper)
+    else:
+        pieces, fit = _pieces(journey, ground, frame, marker, road, config)
     sigma = _control_sigma(ground, pieces, fit, config)
-    reason, kept = _judged(pieces, fit, sigma, reason, config)
+    if is_paper:
+        # The paper's rule is the length of tracklets, which was looked at above.
+        reason = reason.index_fill(0, pieces.marker, KEPT)
+        kept = torch.ones_like(pieces.marker, dtype=torch.bool)
+    else:
+        reason, kept = _judged(pieces, fit, sigma, reason, config)
     lanes = _table(journey, detection, pieces, fit, sigma, config)
     miss = fit.miss[kept[pieces.piece] & (fit.weight > 0.1)]
     points = int(kept[pieces.piece].sum())
@@ -172,24 +178,26 @@ def reconstruct_lanes(
     return lanes.select(kept.nonzero()[:, 0]), report
 
 
-def _cut(
+def _papers_pieces(
+    ground: GroundPoints, frame: Int[Tensor, " p"], marker: Int[Tensor, " p"], config: PaperPieces
+) -> tuple[LanePieces, LaneFit]:
+    """Splines through the most recent points, by plain least squares."""
+    point, count = ground.point_world, config.control_points
+    pieces = cut_by_number(marker, frame, point, number=config.recent_points, control_points=count)
+    pieces = pieces.select(torch.bincount(pieces.piece, minlength=len(pieces)) >= count)
+    sigma = torch.full_like(ground.depth, config.sigma_m)
+    return pieces, fit_pieces(pieces, point, sigma, smoothing=0.0, scales=())
+
+
+def _pieces(
     journey: Journey,
     ground: GroundPoints,
     frame: Int[Tensor, " p"],
     marker: Int[Tensor, " p"],
     road: RoadEstimate,
     config: LaneConfig,
-) -> tuple[LanePieces, Float[Tensor, " p"]]:
-    """Pieces of markers, and the lateral noise expected of each point [m]; the paper's are all equally sure."""
-    if config.method == "paper2017":
-        pieces = cut_by_number(
-            marker,
-            frame,
-            ground.point_world,
-            number=config.paper.recent_points,
-            control_points=config.control_points,
-        )
-        return pieces, torch.full_like(ground.depth, 0.2)
+) -> tuple[LanePieces, LaneFit]:
+    """Splines through pieces of equal length, points weighed by their noise, outliers left out."""
     pieces = cut_by_length(
         marker,
         _along(ground, marker),
@@ -206,7 +214,11 @@ def _cut(
         normal_sigma=config.normal_sigma,
         drift=config.drift,
     )
-    return pieces, sigma
+    pieces = pieces.select(torch.bincount(pieces.piece, minlength=len(pieces)) >= config.min_points)
+    fit = fit_pieces(
+        pieces, ground.point_world, sigma, smoothing=config.smoothing, scales=config.scales
+    )
+    return pieces, fit
 
 
 def _along(ground: GroundPoints, marker: Int[Tensor, " p"]) -> Float[Tensor, " p"]:

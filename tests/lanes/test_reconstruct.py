@@ -105,7 +105,7 @@ def test_paper_method_is_worse_than_ours_but_works(suburb: SimulatedDrives) -> N
     lanes, report = reconstruct_lanes(truth.journey, lane_tracklets(truth), road, paper)
     lateral, vertical, precision = errors(lanes, truth, suburb)
     assert lateral.abs().mean() < 0.25 and vertical.abs().mean() < 0.25 and precision > 0.7
-    assert bool((lanes.control_count == paper.control_points).all())
+    assert bool((lanes.control_count == paper.paper.control_points).all())
     assert report.pruned["kept"] > 0
 
 
