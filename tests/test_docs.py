@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import architecture
 import pytest
 import yaml
 
+import crowdmap_torch
 from crowdmap_torch import __version__
 from crowdmap_torch.geometry import polygon
 
@@ -75,3 +78,37 @@ def test_the_format_has_a_row_for_every_shape():
 def test_the_citation_names_this_version():
     cited = yaml.safe_load(text(ROOT / "CITATION.cff"))
     assert cited["version"] == __version__ and cited["license"] == "Apache-2.0"
+
+
+def papers_equations() -> list[list[str]]:
+    """The rows of the table of equations."""
+    rows = re.findall(r"^\| (?!what |---)(.+) \|$", text(ROOT / "docs" / "PAPER.md"), flags=re.M)
+    return [cells for row in rows if len(cells := [c.strip() for c in row.split(" | ")]) == 6]
+
+
+def test_functions_that_the_papers_equations_name_exist():
+    rows = papers_equations()
+    assert len(rows) > 20
+    for what, _, _, papers, ours, _ in rows:
+        for cell in (papers, ours):
+            (name,) = re.findall(r"^`([\w.]+)`$", cell)
+            found: object = crowdmap_torch
+            for part in name.split("."):
+                is_room = isinstance(found, ModuleType) and hasattr(found, "__path__")
+                path = f"{getattr(found, '__name__', '')}.{part}"
+                found = import_module(path) if is_room else getattr(found, part)
+            assert callable(found), f"{what}: {name}"
+
+
+def test_every_label_of_the_papers_equations_stands_once():
+    labels = [label for _, _, label, *_ in papers_equations() if label != "-"]
+    assert sorted(labels) == ["eq:ba", "eq:ipm", "eq:rne", "eq:simlane", "eq:simsign"]
+    named = [what for what, *_ in papers_equations()]
+    assert len(set(named)) == len(named)
+
+
+def test_each_of_the_papers_equations_has_its_test():
+    sources = [*(ROOT / "tests" / "paper").glob("*.py"), ROOT / "tests/adjustment/test_bundle.py"]
+    tests = set(re.findall(r"^def (test_\w+)", "\n".join(map(text, sources)), flags=re.M))
+    for what, *_, test in papers_equations():
+        assert test.strip("`") in tests, what
