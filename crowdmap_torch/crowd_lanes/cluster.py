@@ -94,7 +94,7 @@ def cluster_lanes(
     """
     label = torch.arange(len(lanes), device=lanes.journey.device)
     packed = lanes.select(label)
-    spectral = replace(config.spectral, whole_limit=_DENSE)
+    spectral = replace(config.spectral, dense_limit=_DENSE)
     control, count = packed.control.point_world, packed.control_count
     rounds = []
     for critical in config.critical_m:

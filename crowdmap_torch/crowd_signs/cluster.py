@@ -109,7 +109,7 @@ def _cluster_paper(
 ) -> SignClusters:
     label = torch.zeros_like(signs.journey)
     spectra = []
-    spectral = replace(config.spectral, whole_limit=_DENSE)
+    spectral = replace(config.spectral, dense_limit=_DENSE)
     for scale in config.scales_m:
         edge = pairs_in_radius(signs.center_world, config.reach_paper * scale)
         i, j = edge.T

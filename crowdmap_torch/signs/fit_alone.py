@@ -5,6 +5,8 @@ Every sign by itself, from poses taken as they are: no prior of what signs are l
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -136,7 +138,7 @@ def _rows(
 
 
 def _scale(
-    views: SignViews, shape: Int[Tensor, " n"], values: dict[str, Tensor]
+    views: SignViews, shape: Int[Tensor, " n"], values: Mapping[str, Tensor]
 ) -> Float[Tensor, " n"]:
     """Robust standard deviation of the pixel errors of each sign [px]."""
     ones = torch.ones_like(values["size"][:, 0])

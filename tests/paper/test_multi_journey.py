@@ -13,6 +13,7 @@ from worlds.crowd_world import make_world, signs_at
 from worlds.sign_drive import CAMERA, straight_poses
 
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
+from crowdmap_torch.adjustment.lenses import seen_points
 from crowdmap_torch.adjustment.observations import LanePointObservations
 from crowdmap_torch.clustering.spectral import (
     SpectralConfig,
@@ -151,14 +152,12 @@ def test_lane_error_is_the_distance_to_the_closest_projected_spline_point():
     count = torch.tensor([5])
     seen = torch.tensor([[557.0, 521.0]], dtype=F64)
     ideal = cameras.unproject(CAMERA, seen)[0]
-    M = cameras.observation_matrix(CAMERA, seen, ideal)
     one, zero = torch.ones(1, dtype=F64), torch.zeros(1).long()
     observation = LanePointObservations(
+        **seen_points(CAMERA, 0, seen, ideal),
         frame=zero,
         journey=zero,
         detection=zero,
-        ideal=ideal,
-        matrix=M,
         normal_camera=torch.tensor([[0.0, 1.0, 0.0]], dtype=F64),
         camera_height=one,
         height_sigma=one,
@@ -170,7 +169,9 @@ def test_lane_error_is_the_distance_to_the_closest_projected_spline_point():
         match = follow(match, observation, T_camera, coefficient, count)
     row, weight, _ = spline_basis.window_flat(match.t, zero, count)
     c0, c1, c2, c3 = coefficient[row[0]]
-    found = lane_reprojection(T_camera[0], c0, c1, c2, c3, weight[0], match.normal_px[0], M[0])
+    found = lane_reprojection(
+        T_camera[0], c0, c1, c2, c3, weight[0], match.normal_px[0], observation.matrix[0]
+    )
 
     def distance(t: float) -> float:
         point = [s.natural_spline(control[:, axis].tolist(), t) for axis in range(3)]
