@@ -14,9 +14,9 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
 from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
+from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
 from crowdmap_torch.geometry import se3, spline_basis
 from crowdmap_torch.geometry.camera import Camera
-from crowdmap_torch.noise.pixels import noise_by_box, shared_error
 from crowdmap_torch.noise.pose_prior import PosePrior
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
@@ -29,7 +29,7 @@ from crowdmap_torch.optim.problem import (
     pull_euclidean,
     pull_positive,
 )
-from crowdmap_torch.optim.robust import JointTukey, Tukey, median_scale
+from crowdmap_torch.optim.robust import JointTukey, Tukey
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
 from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBackend
 from crowdmap_torch.optim.solvers.elimination import landmark_rank
@@ -283,45 +283,19 @@ class Bundle(nn.Module):
 
     def _narrow(self, values: dict[str, Tensor]) -> bool:
         """Narrows the scales of pixels to what the residuals show; returns whether they have come to rest."""
-        alike = self.config.method == "paper2017"
-        seen, small_box = (self._seen_alike if alike else self._seen_by_kind)(values)
+        of_corners, of_lanes = self.scale.new_zeros(0, 2), self.scale[:0]
+        for term in self._corner_term(1.0).values():
+            of_corners = whitened_residuals(term, values)
+        matched = torch.nonzero(self.matches.valid)[:, 0]
+        if len(self.lane_points):
+            term = self._lane_terms(1.0)["lane_reprojection"]
+            of_lanes = whitened_residuals(term, values)[matched, 0]
+        errors = PixelErrors(self.corners, of_corners, self.lane_points[matched], of_lanes)
+        seen, small_box = pixel_scales(errors, self.small_box, self.config)
         narrows = seen < _NARROWS * self.scale
         self.scale.copy_(torch.where(narrows, seen, self.scale))
         self.small_box.copy_(torch.where(narrows[0], small_box, self.small_box))
         return not bool(narrows.any())
-
-    def _seen_alike(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """As `_seen_by_kind`, one scale for every pixel, of signs and of lanes."""
-        parts = [whitened_residuals(t, values).flatten() for t in self._corner_term(1.0).values()]
-        if len(self.lane_points):
-            lanes = whitened_residuals(self._lane_terms(1.0)["lane_reprojection"], values)
-            parts.append(lanes[self.matches.valid, 0])
-        residual = torch.cat([self.scale[:0], *parts])
-        scale = median_scale(residual, floor=self.config.sign_sigma_px)
-        return torch.stack((scale, scale, torch.ones_like(scale))), torch.zeros_like(self.small_box)
-
-    def _seen_by_kind(self, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """`scale` and `small_box` as the residuals show them."""
-        config = self.config
-        seen = self.scale.new_tensor(
-            [config.sign_sigma_px, config.lane_sigma_px, config.lane_correlation]
-        )
-        small_box = self.small_box
-        for term in self._corner_term(1.0).values():
-            # Of a two-dimensional normal residual the median length is 1.1774 sigma.
-            length = whitened_residuals(term, values).norm(dim=-1) / 1.1774
-            tight = self.corners.loose_px == 0
-            noise = noise_by_box(length[tight], self.corners.box_px[tight])
-            seen[0] = noise.large_px.clamp_min(config.sign_sigma_px)
-            small_box = noise.small_box_px
-        if len(self.lane_points):
-            valid, rows = self.matches.valid, self.lane_points
-            term = self._lane_terms(1.0)["lane_reprojection"]
-            residual = whitened_residuals(term, values)[valid, 0]
-            seen[1] = median_scale(residual, floor=config.lane_sigma_px)
-            together = shared_error(residual, rows.frame[valid], rows.detection[valid])
-            seen[2] = together.clamp_min(config.lane_correlation)
-        return seen, small_box
 
     def problem(self) -> Problem:
         """The least-squares problem with the matches and scales of the moment, lanes held where they are.
