@@ -22,13 +22,3 @@ def test_the_same_seed_destroys_the_same(street: Path, tmp_path: Path) -> None:
         folder.rename(tmp_path / f"{attempt}")
     assert seen[0] == seen[1]
     assert seen[0][1] != digest(street)
-
-
-def test_what_a_mutation_left_is_destroyed_once_more(tmp_path: Path) -> None:
-    # Text that Python's own readers cannot read: a level within a level, five thousand times.
-    for seed in range(5):
-        folder = tmp_path / f"{seed}"
-        folder.mkdir()
-        (folder / "config.yaml").write_text("[" * 5000)
-        (done,) = destroy(folder, np.random.default_rng(seed))[:1]
-        assert done.startswith("config.yaml: ")
