@@ -107,8 +107,10 @@ def cuts(
     """For each signal so many instants, spread over the stages, with one worker and with two in turn."""
     generator = torch.Generator().manual_seed(seed)
     shares = iter(torch.rand(len(numbers) * count, generator=generator).tolist())
+    # Where their number is even a round later the turns are exchanged: every stage meets one worker and two.
+    swaps = len(stages) % 2 == 0
     return [
-        Cut(1 + k % 2, stages[(k // 2) % len(stages)], next(shares), number)
+        Cut(1 + (k + swaps * (k // len(stages))) % 2, stages[k % len(stages)], next(shares), number)
         for number in numbers
         for k in range(count)
     ]

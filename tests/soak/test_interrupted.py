@@ -7,16 +7,26 @@ import shutil
 import signal
 from pathlib import Path
 
+import pytest
 from worlds.programs import begin
 
 from crowdmap_torch.soak.interrupted import STAGES, cuts, differences
 
 
-def test_instants_are_spread_over_all_stages_and_numbers_of_workers() -> None:
-    chosen = cuts([signal.SIGKILL], 60, seed=1)
+@pytest.mark.parametrize("stages", [STAGES, STAGES[:2], STAGES[:1]])
+def test_instants_are_spread_over_all_stages_and_numbers_of_workers(
+    stages: tuple[str, ...],
+) -> None:
+    chosen = cuts([signal.SIGKILL], 60, stages, seed=1)
     ways = {(cut.workers, cut.stage) for cut in chosen}
-    assert len(chosen) == 60 and ways == {(w, stage) for w in (1, 2) for stage in STAGES}
+    assert len(chosen) == 60 and ways == {(w, stage) for w in (1, 2) for stage in stages}
     assert all(0 <= cut.share < 1 for cut in chosen) and len({cut.share for cut in chosen}) == 60
+
+
+def test_ten_instants_meet_every_stage() -> None:
+    chosen = cuts([signal.SIGINT, signal.SIGTERM], 10, seed=0)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        assert {cut.stage for cut in chosen if cut.number == number} == set(STAGES)
 
 
 def test_results_differ_by_whatever_is_no_time(tmp_path: Path) -> None:
