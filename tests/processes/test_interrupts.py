@@ -10,8 +10,10 @@ from worlds.programs import PATIENCE_S, begin
 from crowdmap_torch.processes.interrupts import Interruptible, held, keeping, kept
 
 PROGRAM = """
-import hashlib, sys, time
+import hashlib, signal, sys, time
 from crowdmap_torch.processes.interrupts import Interruptible, held
+# The tests themselves may run under `nohup`, which programs inherit.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 say = lambda name: sys.stderr.write(f"ended by {name}\\n")
 
 def begun():
