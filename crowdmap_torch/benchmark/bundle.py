@@ -33,6 +33,7 @@ from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.robust import Huber, Tukey
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.ranges import Rounds, Workers, argument
 
 MINIMISATION = KeptMatrixConfig(
@@ -90,6 +91,7 @@ def solve_file(problem: Path, out: Path | None, device: torch.device) -> dict[st
     return figures
 
 
+@one_core_each()
 def solve(
     problem: FreeCorners, device: torch.device
 ) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:
