@@ -238,9 +238,9 @@ def plot_residuals_over_image(
         drawn = axes.quiver(
             x, y, u, v, angles="xy", scale_units="xy", scale=longest / cell, color=MAP, width=0.002
         )
-        axes.quiverkey(drawn, 0.9, 1.03, longest, f"{longest:.2f} px")
+        axes.quiverkey(drawn, 0.88, 1.05, longest, f"{longest:.2f} px", labelpos="E")
     axes.set(xlim=(0, width), ylim=(height, 0), xlabel="u [px]", ylabel="v [px]")
-    axes.set_title("median residual, projected minus detected")
+    axes.set_title("median residual, projected minus detected", loc="left")
     axes.set_aspect("equal")
     return figure
 
