@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +50,11 @@ def mutate_document(path: Path, rng: np.random.Generator) -> str:
     try:
         text = path.read_text("utf-8")
         content = json.loads(text) if is_json else yaml.safe_load(text)
+        done = _change(content, rng)
+        text = json.dumps(content) if is_json else yaml.safe_dump(content)
     except (ValueError, RecursionError, yaml.YAMLError):
+        # Not to be read, or too deep, as another mutation may have left it.
         return mutate_text(path, rng)
-    done = _change(content, rng)
-    text = json.dumps(content) if is_json else yaml.safe_dump(content)
     path.write_text(text, "utf-8", "surrogatepass")
     return done
 
@@ -123,16 +125,17 @@ def _change(content: Any, rng: np.random.Generator) -> str:
     return f"{way} to {str(inside[key])[:40]!r}"
 
 
-def _places(content: Any, way: str = "") -> Any:
-    """Every place of a nested content: what it is in, its key there, and its name."""
-    items = (
-        content.items()
-        if isinstance(content, dict)
-        else enumerate(content)
-        if isinstance(content, list)
-        else ()
-    )
-    for key, value in items:
-        name = f"{way}.{key}" if way else str(key)
-        yield content, key, name
-        yield from _places(value, name)
+def _places(content: Any) -> Iterator[tuple[Any, Any, str]]:
+    """Every place of a nested content: what it is in, its key there, and its name; what stands in many places once."""
+    seen: set[int] = set()
+    left = [(content, "")]
+    while left:
+        inside, way = left.pop()
+        if id(inside) in seen or not isinstance(inside, dict | list):
+            continue
+        seen.add(id(inside))
+        items = list(inside.items() if isinstance(inside, dict) else enumerate(inside))
+        for key, value in items:
+            name = f"{way}.{key}" if way else str(key)
+            yield inside, key, name
+            left.append((value, name))
