@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from crowdmap_torch.adjustment.observations import LanePointObservations
+from crowdmap_torch.clustering.neighbours import layered
 from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import plane, spline_basis
 from crowdmap_torch.residuals.reprojection import MIN_DEPTH
@@ -58,7 +59,7 @@ def nearest_lanes(
     samples, point_world = samples * squash, point_world * squash
     if of is not None:
         samples, point_world = (
-            _layered(x, k, gate) for x, k in ((samples, piece), (point_world, of))
+            layered(x, k, gate) for x, k in ((samples, piece), (point_world, of))
         )
     index, found = _nearest(samples, point_world, gate)
     return torch.where(found, piece[index], none), t[index]
@@ -83,18 +84,11 @@ def supported_lanes(
     first = torch.tensor([0, *accumulate(count)], device=none.device)[:-1]
     tracklet = torch.cat([one.label for one in tracklets])[first[points.journey] + points.detection]
     every = 1 + int(torch.maximum(tracklet.max(), support.tracklet.max()))
-    sample = _layered(support.point_world, support.journey * every + support.tracklet, reach)
+    sample = layered(support.point_world, support.journey * every + support.tracklet, reach)
     index, found = _nearest(
-        sample, _layered(point_world, points.journey * every + tracklet, reach), reach
+        sample, layered(point_world, points.journey * every + tracklet, reach), reach
     )
     return torch.where(found & (tracklet >= 0), support.lane[index], none)
-
-
-def _layered(
-    point: Float[Tensor, "m 3"], layer: Int[Tensor, " m"], reach: float
-) -> Float[Tensor, "m 4"]:
-    """Points with a coordinate more, in which the layers lie farther apart than a search reaches."""
-    return torch.cat((point, 2 * reach * layer[:, None].to(point)), dim=1)
 
 
 def _nearest(

@@ -18,12 +18,12 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import camera
 from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.residuals.reprojection import MIN_DEPTH
 from crowdmap_torch.tables import Journey, Rows
 
 _WITHIN = 0.99
-"""Share of the radius up to which a lens is one-to-one, beyond which it is taken as it is around the detection."""
-_MIN_DEPTH = 0.05
-"""Likewise nearer than this [m], or behind the camera."""
+"""Share of the radius up to which a lens is one-to-one, beyond which, as nearer than `MIN_DEPTH`, it is taken
+as it is around the detection."""
 Seen = TypeVar("Seen", bound="SeenPoints")
 
 
@@ -89,10 +89,10 @@ def relinearised(
         if not len(mine):
             continue
         point, around = point_camera[mine], seen.ideal[mine]
-        depth = point[:, 2:].clamp_min(_MIN_DEPTH)
+        depth = point[:, 2:].clamp_min(MIN_DEPTH)
         ideal = point[:, :2] / depth
         radius = ideal.square().sum(-1, keepdim=True).sqrt()
-        sound = (point[:, 2:] > _MIN_DEPTH) & (radius < _WITHIN * lens.monotonic_radius)
+        sound = (point[:, 2:] > MIN_DEPTH) & (radius < _WITHIN * lens.monotonic_radius)
         at = torch.where(sound, ideal, around)
         matrix[mine] = camera.observation_matrix(lens, seen.px[mine], at, bend=seen.bend[mine])
     return replace(seen, matrix=matrix)

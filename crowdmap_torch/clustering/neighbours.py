@@ -63,3 +63,10 @@ def pairs_between(
     row_a, row_b = (torch.as_tensor(pairs[name].astype(np.int64)) for name in ("i", "j"))
     distance = torch.as_tensor(pairs["v"].copy()).to(a)
     return row_a.to(a.device), row_b.to(a.device), distance
+
+
+def layered(
+    point: Float[Tensor, "n k"], layer: Int[Tensor, " n"], reach: float
+) -> Float[Tensor, "n _"]:
+    """Points with a coordinate more, in which the layers lie farther apart than a search reaches."""
+    return torch.cat((point, 2 * reach * layer[:, None].to(point)), dim=1)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_sum
-from crowdmap_torch.clustering.neighbours import pairs_in_radius
+from crowdmap_torch.clustering.neighbours import layered, pairs_in_radius
 from crowdmap_torch.crowd_lanes.line_samples import (
     LineSamples,
     along_axis,
@@ -108,9 +108,7 @@ def stray_samples(samples: LaneSamples, *, beside: tuple[float, float]) -> Bool[
     line = samples.line
     least, largest = beside
     reach = (largest**2 + 1.5**2) ** 0.5
-    # Tracks lie in layers of their own, farther apart than the search reaches.
-    layered = torch.cat((line.point, 2 * reach * line.track[:, None].to(line.point)), dim=1)
-    i, j = pairs_in_radius(layered, reach).T
+    i, j = pairs_in_radius(layered(line.point, line.track, reach), reach).T
     delta = line.point[j] - line.point[i]
     axis = line.direction[i]
     along, across = along_axis(delta, axis).abs(), left_of_axis(delta, axis).abs()

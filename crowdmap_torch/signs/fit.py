@@ -31,7 +31,15 @@ from crowdmap_torch.noise.positioning import (
 )
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.linearize import residuals as rows_of_term
-from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
+from crowdmap_torch.optim.problem import (
+    CostTerm,
+    Problem,
+    Variable,
+    euclidean,
+    positive,
+    pull_euclidean,
+    pull_positive,
+)
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.banded_schur import BandBackend
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, NormalEquations
@@ -206,8 +214,8 @@ def _problem(
     """One independent problem per sign: its views, and what is usual."""
     own = torch.arange(len(shape), device=shape.device)
     variables = {
-        "sign": Variable(6, se3.retract, group=own),
-        "size": Variable(2, positive, group=own),
+        "sign": Variable(6, se3.retract, group=own, pull=se3.pull),
+        "size": Variable(2, positive, group=own, pull=pull_positive),
     }
     moved = se3.retract(views.T_world_camera, noise.pose_error)
     expected = (noise.by_pose @ noise.pose_error[..., None])[..., 0]
@@ -273,7 +281,7 @@ def _with_drift(
         )
     variables = {name: replace(kind, group=None) for name, kind in problem.variables.items()}
     return Problem(
-        {**variables, "drift": Variable(8, euclidean)},
+        {**variables, "drift": Variable(8, euclidean, pull=pull_euclidean)},
         {
             **terms,
             "nonholonomic": drive.nonholonomic,

@@ -16,7 +16,7 @@ from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.triangulation import midpoint_ragged
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.linearize import residuals
-from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, positive
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, positive, pull_positive
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
@@ -123,8 +123,8 @@ def reprojection_problem(
         jacobian=sign_view_jacobian,
     )
     variables = {
-        "sign": Variable(6, se3.retract, group=own),
-        "size": Variable(2, positive, group=own),
+        "sign": Variable(6, se3.retract, group=own, pull=se3.pull),
+        "size": Variable(2, positive, group=own, pull=pull_positive),
     }
     return Problem(variables, {"corners": term}, group_count=len(own))
 
