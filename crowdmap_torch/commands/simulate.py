@@ -15,9 +15,11 @@ from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 from crowdmap_torch.io.errors import input_read
-from crowdmap_torch.ranges import Count, Seed, argument, hints
+from crowdmap_torch.ranges import Count, Factor, Seed, argument, hints
 from crowdmap_torch.simulate.dataset import DETECTION_PRESETS, SimulationConfig, write_dataset
+from crowdmap_torch.simulate.errors import ALL, ERRORS, with_errors
 from crowdmap_torch.simulate.faults import KINDS
+from crowdmap_torch.simulate.fleet import FleetConfig
 from crowdmap_torch.simulate.lane_perception import LaneDetectionConfig
 from crowdmap_torch.simulate.positioning import POSITIONING_PRESETS, PositioningConfig
 from crowdmap_torch.simulate.rigs import RigConfig
@@ -33,6 +35,7 @@ _GROUPS = {
     "roadside": SignConfig,
     "vehicle": VehicleConfig,
     "rig": RigConfig,
+    "fleet": FleetConfig,
     "positioning": PositioningConfig,
     "signs": SignDetectionConfig,
     "lanes": LaneDetectionConfig,
@@ -56,6 +59,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KIND,...",
         help=f"spoils one journey for each: {', '.join(KINDS)}",
     )
+    parser.add_argument(
+        "--errors",
+        default="",
+        metavar="NAME,...",
+        help=f"what real vehicles get wrong, at the size they do: {ALL} for all of {', '.join(ERRORS)}",
+    )
+    parser.add_argument(
+        "--error-factor",
+        type=argument(Factor),
+        default=1.0,
+        metavar="N",
+        help="the errors of --errors are this many times as large",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replaces a dataset in OUT")
     for name, config in _GROUPS.items():
         group = parser.add_argument_group(name, inspect.getdoc(config))
@@ -75,27 +91,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Writes the dataset into `options.out`."""
-    world = WORLD_PRESETS[options.world]
-    signs, lanes = DETECTION_PRESETS[options.detection]
     with input_read():
-        config = SimulationConfig(
-            world=_changed(
-                world,
-                options,
-                "world",
-                road=_changed(world.road, options, "road"),
-                signs=_changed(world.signs, options, "roadside"),
-            ),
-            vehicle=_changed(VehicleConfig(), options, "vehicle"),
-            rig=_changed(RigConfig(), options, "rig"),
-            positioning=_changed(POSITIONING_PRESETS[options.positioning], options, "positioning"),
-            signs=_changed(signs, options, "signs"),
-            lanes=_changed(lanes, options, "lanes"),
-            journeys=options.journeys,
-            seed=options.seed,
-            world_seed=options.world_seed,
-            bad_drives=tuple(kind for kind in options.bad_drives.split(",") if kind),
-        )
+        config = _configuration(options)
         begun = time.perf_counter()
         built = write_dataset(
             config, options.out, overwrite=options.overwrite, on_journey=_progress(options.journeys)
@@ -104,6 +101,40 @@ def run(options: argparse.Namespace) -> None:
         f"{options.out}: {options.journeys} journeys, {len(built.signs)} signs, "
         f"{len(built.markers)} lane markers in {time.perf_counter() - begun:.1f} s"
     )
+
+
+def _configuration(options: argparse.Namespace) -> SimulationConfig:
+    """The presets, with the errors that are asked for and all that options say of single numbers."""
+    signs, lanes = DETECTION_PRESETS[options.detection]
+    config = SimulationConfig(
+        world=WORLD_PRESETS[options.world],
+        positioning=POSITIONING_PRESETS[options.positioning],
+        signs=signs,
+        lanes=lanes,
+        journeys=options.journeys,
+        seed=options.seed,
+        world_seed=options.world_seed,
+        bad_drives=_named(options.bad_drives),
+    )
+    if errors := _named(options.errors):
+        config = with_errors(config, errors, options.error_factor)
+    world = config.world
+    sections = ("vehicle", "rig", "fleet", "positioning", "signs", "lanes")
+    return replace(
+        config,
+        world=_changed(
+            world,
+            options,
+            "world",
+            road=_changed(world.road, options, "road"),
+            signs=_changed(world.signs, options, "roadside"),
+        ),
+        **{name: _changed(getattr(config, name), options, name) for name in sections},
+    )
+
+
+def _named(text: str) -> tuple[str, ...]:
+    return tuple(name for name in text.split(",") if name)
 
 
 def _kind(hint: object) -> dict:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -14,9 +14,13 @@ from crowdmap_torch.io.atomic import atomic_folder
 from crowdmap_torch.io.documents import write_json
 from crowdmap_torch.ranges import Count, Seed, Settings
 from crowdmap_torch.simulate import faults, files, lane_perception, sign_detections
+from crowdmap_torch.simulate.fleet import FleetConfig, Vehicle, build_vehicle
 from crowdmap_torch.simulate.lane_perception import LaneDetectionConfig, LaneRows, detect_lanes
+from crowdmap_torch.simulate.motion import Motion
 from crowdmap_torch.simulate.positioning import (
+    DriveErrors,
     PositioningConfig,
+    drive_errors,
     measured_poses,
     pose_errors,
     reported_sigmas,
@@ -27,7 +31,7 @@ from crowdmap_torch.simulate.sign_perception import detect_signs
 from crowdmap_torch.simulate.vehicle import Drive, VehicleConfig, drive_through
 from crowdmap_torch.simulate.worlds import WORLD_PRESETS, World, WorldConfig, build_world
 
-_WORLD, _RIG, _JOURNEY, _FAULTS = range(4)
+_WORLD, _RIG, _JOURNEY, _FAULTS, _VEHICLE, _DETECTOR, _DRIVE = range(7)
 """Streams of random numbers: what one of them draws does not depend on how much the others did."""
 _FIRST_START = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 DETECTION_PRESETS = {
@@ -43,6 +47,7 @@ class SimulationConfig(Settings):
     world: WorldConfig = field(default_factory=lambda: WORLD_PRESETS["suburb"])
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     rig: RigConfig = field(default_factory=RigConfig)
+    fleet: FleetConfig = field(default_factory=FleetConfig)
     positioning: PositioningConfig = field(default_factory=PositioningConfig)
     signs: SignDetectionConfig = field(default_factory=SignDetectionConfig)
     lanes: LaneDetectionConfig = field(default_factory=LaneDetectionConfig)
@@ -59,12 +64,14 @@ class SimulatedJourney:
     """One journey as it was, and as its files tell it."""
 
     journey_id: str
-    rig: SimulatedRig
+    vehicle: Vehicle
     drive: Drive
+    """As each picture is taken, in its middle row."""
     started: datetime
     T_world_link: Float[np.ndarray, "f 4 4"]
-    """True poses of the pose link."""
+    """Poses of the pose link of which the mount as it is stated makes the true poses of the camera."""
     T_reported: Float[np.ndarray, "f 4 4"]
+    errors: DriveErrors
     signs: SignRows
     lanes: LaneRows
     fault: str | None
@@ -76,47 +83,87 @@ def make_world(config: SimulationConfig) -> World:
     return build_world(config.world, np.random.default_rng([seed, _WORLD]))
 
 
-def make_fleet(config: SimulationConfig) -> tuple[SimulatedRig, ...]:
-    """The rigs that the journeys use in turn."""
+def make_rigs(config: SimulationConfig) -> tuple[SimulatedRig, ...]:
+    """The rigs, as they are stated."""
     return tuple(
         build_rig(config.rig, index, np.random.default_rng([config.seed, _RIG, index]))
         for index in range(config.rig.rigs)
     )
 
 
+def make_fleet(config: SimulationConfig) -> tuple[Vehicle, ...]:
+    """The vehicles that drive the journeys in turn."""
+    rigs = make_rigs(config)
+    fleet = []
+    for index in range(config.fleet.vehicles or len(rigs)):
+        number = index % len(rigs)
+        detector = (0, number) if config.fleet.one_detector else (1, index)
+        fleet.append(
+            build_vehicle(
+                config.fleet,
+                index,
+                rigs[number],
+                np.random.default_rng([config.seed, _VEHICLE, index]),
+                np.random.default_rng([config.seed, _DETECTOR, *detector]),
+            )
+        )
+    return tuple(fleet)
+
+
 def make_journey(
     config: SimulationConfig,
     world: World,
-    fleet: tuple[SimulatedRig, ...],
+    fleet: tuple[Vehicle, ...],
     index: int,
     fault: str | None = None,
 ) -> SimulatedJourney:
     """The `index`-th journey; it does not depend on how many there are."""
     rng = np.random.default_rng([config.seed, _JOURNEY, index])
     drive_rng, pose_rng, sign_rng, lane_rng, fault_rng = rng.spawn(5)
-    rig = fleet[index % len(fleet)]
-    # With both directions the rigs take turns in pairs, so that each rig drives both ways.
+    vehicle = fleet[index % len(fleet)]
+    # With both directions the vehicles take turns in pairs, so that each of them drives both ways.
     direction = 1
     if config.world.both_directions:
         direction = 1 if index % 2 == 0 else -1
-        rig = fleet[index // 2 % len(fleet)]
+        vehicle = fleet[index // 2 % len(fleet)]
+    rig = vehicle.true_rig
     drive = drive_through(world, rig, config.vehicle, drive_rng, direction=direction)
-    T_world_link = _link_poses(drive, rig)
-    T_reported = measured_poses(
-        T_world_link, pose_errors(drive.distance, config.positioning, pose_rng)
+    wrong = drive_errors(
+        drive.distance, config.positioning, np.random.default_rng([config.seed, _DRIVE, index])
     )
+    error = pose_errors(drive.distance, config.positioning, pose_rng)
+    if wrong.outage is not None:
+        error = replace(error, translation=error.translation + wrong.outage.shift(drive.distance))
+    T_reported = measured_poses(_stamped_poses(drive, vehicle), error)
     seen_from, camera = faults.with_sensor_fault(drive, rig.camera, fault, fault_rng)
     claimed = faults.with_upload_fault(world.signs, fault, fault_rng)
     rate = config.vehicle.frame_rate_hz
     return SimulatedJourney(
         journey_id=_journey_id(index),
-        rig=rig,
+        vehicle=vehicle,
         drive=drive,
         started=_FIRST_START + timedelta(hours=19 * index),
-        T_world_link=T_world_link,
+        T_world_link=_camera_poses(drive) @ np.linalg.inv(vehicle.rig.T_link_camera),
         T_reported=faults.with_pose_fault(T_reported, drive, fault, fault_rng),
-        signs=detect_signs(claimed, seen_from, camera, config.signs, sign_rng, frame_rate_hz=rate),
-        lanes=detect_lanes(world, seen_from, camera, config.lanes, lane_rng, frame_rate_hz=rate),
+        errors=wrong,
+        signs=detect_signs(
+            claimed,
+            seen_from,
+            camera,
+            config.signs,
+            sign_rng,
+            frame_rate_hz=rate,
+            errors=vehicle.errors,
+        ),
+        lanes=detect_lanes(
+            world,
+            seen_from,
+            camera,
+            config.lanes,
+            lane_rng,
+            frame_rate_hz=rate,
+            errors=vehicle.errors,
+        ),
         fault=fault,
     )
 
@@ -135,6 +182,7 @@ def write_dataset(
         if not out.is_dir() or (any(out.iterdir()) and not (out / "dataset.json").exists()):
             raise ValueError(f"{out} is no dataset (it has no dataset.json); it is left alone")
     world, fleet = make_world(config), make_fleet(config)
+    drives = {}
     rng = np.random.default_rng([config.seed, _FAULTS])
     fault_of = faults.spread_faults(config.bad_drives, config.journeys, rng)
     settings = {"generator": "crowdmap_torch.simulate", "settings": asdict(config)}
@@ -143,17 +191,23 @@ def write_dataset(
             folder / "dataset.json",
             {"format": "crowdmap-dataset", "version": 1, "origin": files.ORIGIN},
         )
-        for rig in fleet:
+        for rig in make_rigs(config):
             files.write_rig(folder / "rigs" / rig.rig_id, rig)
         for index in range(config.journeys):
             journey = make_journey(config, world, fleet, index, fault_of[index])
             _write_journey(config, folder, world, journey)
+            drives[journey.journey_id] = {
+                "vehicle_id": journey.vehicle.vehicle_id,
+                **asdict(journey.errors),
+            }
             on_journey(index)
         files.write_survey(folder / "survey", world, settings)
         write_json(
             folder / "survey" / "truth" / "bad_drives.json",
             {_journey_id(k): fault for k, fault in enumerate(fault_of) if fault is not None},
         )
+        files.write_vehicles(folder / "survey" / "truth" / "vehicles.json", fleet)
+        write_json(folder / "survey" / "truth" / "drives.json", drives)
     return world
 
 
@@ -168,8 +222,8 @@ def _write_journey(
             "format": "crowdmap-journey",
             "version": 1,
             "journey_id": journey.journey_id,
-            "rig": journey.rig.rig_id,
-            "vehicle_id": f"vehicle-{journey.rig.rig_id[-1]}",
+            "rig": journey.vehicle.rig.rig_id,
+            "vehicle_id": journey.vehicle.vehicle_id,
             "started_at": journey.started.strftime("%Y-%m-%dT%H:%M:%SZ"),
         },
     )
@@ -178,7 +232,7 @@ def _write_journey(
         journey.drive,
         journey.T_reported,
         started_ns,
-        reported_sigmas(config.positioning),
+        reported_sigmas(config.positioning, journey.errors),
     )
     files.write_sign_rows(folder / "signs.parquet", journey.signs, journey.drive)
     files.write_lane_rows(folder / "lanes.parquet", journey.lanes, journey.drive)
@@ -197,10 +251,16 @@ def _journey_id(index: int) -> str:
     return f"journey-{index:03d}"
 
 
-def _link_poses(drive: Drive, rig: SimulatedRig) -> Float[np.ndarray, "f 4 4"]:
-    """Poses of the link that the positioning module reports: the body is rigid."""
+def _stamped_poses(drive: Drive, vehicle: Vehicle) -> Float[np.ndarray, "f 4 4"]:
+    """True poses of the link that the positioning module reports, at the stamps of the pictures: the body is rigid."""
+    late = vehicle.errors.clock_s
+    T_world_camera = Motion(drive).poses(drive.t - late) if late else _camera_poses(drive)
+    return T_world_camera @ np.linalg.inv(vehicle.true_rig.T_link_camera)
+
+
+def _camera_poses(drive: Drive) -> Float[np.ndarray, "f 4 4"]:
     T_world_camera = np.zeros((len(drive), 4, 4))
     T_world_camera[:, :3, :3] = drive.R_world_camera
     T_world_camera[:, :3, 3] = drive.p_world_camera
     T_world_camera[:, 3, 3] = 1.0
-    return T_world_camera @ np.linalg.inv(rig.T_link_camera)
+    return T_world_camera

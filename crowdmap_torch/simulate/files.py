@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from jaxtyping import Float
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io import poses
-from crowdmap_torch.io.documents import write_json
+from crowdmap_torch.io.documents import plain, write_json
 from crowdmap_torch.io.writing import (
     list_column,
     name_column,
@@ -19,6 +21,7 @@ from crowdmap_torch.io.writing import (
     row_column,
     write_parquet,
 )
+from crowdmap_torch.simulate.fleet import Vehicle
 from crowdmap_torch.simulate.lane_perception import TYPES, LaneRows
 from crowdmap_torch.simulate.rigs import SimulatedRig, rig_yaml
 from crowdmap_torch.simulate.sign_detections import SignRows, all_codes
@@ -131,6 +134,15 @@ def write_truth(
             "height_m": drive.camera_height,
         },
     )
+
+
+def write_vehicles(path: Path, fleet: Sequence[Vehicle]) -> None:
+    """What is truly different about each vehicle."""
+    content = {
+        vehicle.vehicle_id: {"rig": vehicle.rig.rig_id, **plain(asdict(vehicle.errors))}
+        for vehicle in fleet
+    }
+    write_json(path, content)
 
 
 def write_survey(folder: Path, world: World, provenance: dict) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 
-from crowdmap_torch.geometry.camera import Camera, project
+from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.ranges import (
     CountOrNone,
     CountSpan,
@@ -21,7 +20,9 @@ from crowdmap_torch.ranges import (
     Share,
     Span,
 )
+from crowdmap_torch.simulate.fleet import NO_ERRORS, VehicleErrors
 from crowdmap_torch.simulate.markers import Markers
+from crowdmap_torch.simulate.motion import Shutter
 from crowdmap_torch.simulate.vehicle import Drive
 from crowdmap_torch.simulate.worlds import World
 
@@ -106,26 +107,30 @@ def detect_lanes(
     rng: np.random.Generator,
     *,
     frame_rate_hz: float,
+    errors: VehicleErrors = NO_ERRORS,
 ) -> LaneRows:
-    """All lane detections of a drive, frame after frame."""
+    """All lane detections of a drive, frame after frame; `camera` is the true one."""
     is_hidden = _is_hidden(drive, config, rng, frame_rate_hz)
+    shutter = Shutter(drive, camera, errors.read_out_s)
     parts = []
     for first in range(0, len(drive), _CHUNK_FRAMES):
         frames = np.arange(first, min(first + _CHUNK_FRAMES, len(drive)))
-        parts.append(_detect(world, drive, camera, config, rng, frames[~is_hidden[frames]]))
+        seen = frames[~is_hidden[frames]]
+        parts.append(_detect(world, shutter, errors.lane_left_m, config, rng, seen))
     columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(LaneRows))
     return LaneRows(*columns)
 
 
 def _detect(
     world: World,
-    drive: Drive,
-    camera: Camera,
+    shutter: Shutter,
+    left_m: float,
     config: LaneDetectionConfig,
     rng: np.random.Generator,
     frames: Int[np.ndarray, " f"],
 ) -> LaneRows:
-    """The detections in some of the frames."""
+    """The detections in some of the frames, their points `left_m` to the left of the markers."""
+    drive = shutter.drive
     frame, marker = _nearest_markers(world, drive, config, frames)
     kept = rng.random(len(frame)) >= config.missed_lanes
     frame, marker = frame[kept], marker[kept]
@@ -141,15 +146,15 @@ def _detect(
 
     ahead = _places_ahead(len(frame), config, rng)
     marker_at, is_merged = _merged(frame, marker, ahead, is_false, config, rng)
-    point, is_there = _points(world, drive, frame, marker_at, ahead, rng)
+    point, is_there = _points(world, drive, frame, marker_at, ahead, left_m, rng)
     aside = np.where(
         is_false, rng.uniform(1.2, 1.9, len(frame)) * rng.choice([-1, 1], len(frame)), 0
     )
     point = point - (aside[:, None] * drive.R_world_camera[frame, :, 0])[:, None]
-    px, is_visible = _seen(point, drive, camera, frame)
+    px, is_visible = _seen(point, shutter, frame)
     is_there &= is_visible
     is_there &= _is_sampled(world.markers, marker, config, rng)
-    px, is_there = _with_noise(px, is_there, camera, config, rng)
+    px, is_there = _with_noise(px, is_there, shutter.camera, config, rng)
 
     enough = is_there.sum(-1) >= 3
     frame, marker, is_false, is_merged = (
@@ -244,30 +249,39 @@ def _points(
     frame: Int[np.ndarray, " d"],
     marker: Int[np.ndarray, "d k"],
     ahead: Float[np.ndarray, "d k"],
+    left_m: float,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "d k 3"], Bool[np.ndarray, "d k"]]:
-    """World points of the markers, and which of them are painted there."""
+    """World points of the markers, and which of them are painted there.
+
+    Points are `left_m` to the left of the middle, as the driver sees it; those of markers across the road are not.
+    """
     share = (np.arange(_SAMPLES) + rng.uniform(0, 1, ahead.shape)) / _SAMPLES
     parameter = _parameters(world, drive, frame, marker, ahead, share)
     is_painted = world.markers.is_painted(marker, parameter)
     inside = np.clip(parameter, 0, world.markers.length()[marker])
-    return world.markers.at(marker, inside), is_painted
+    point = world.markers.at(marker, inside)
+    if left_m:
+        station = world.markers.station[marker] + inside
+        runs_across = np.isnan(station)
+        left = world.road.leftwards(np.where(runs_across, 0.0, station)) * drive.direction
+        point = point + left_m * np.where(runs_across[..., None], 0.0, left)
+    return point, is_painted
 
 
 def _seen(
-    point: Float[np.ndarray, "d k 3"], drive: Drive, camera: Camera, frame: Int[np.ndarray, " d"]
+    point: Float[np.ndarray, "d k 3"], shutter: Shutter, frame: Int[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, "d k 2"], Bool[np.ndarray, "d k"]]:
     """Pixels of the points; not visible are those outside the image and those behind a crest."""
-    p_camera = _in_camera(point, drive, frame)
-    px, visible = project(camera, torch.from_numpy(p_camera))
-    row = np.where(visible.numpy(), px.numpy()[..., 1], np.inf)
+    p_camera, px, visible = shutter.see(point, frame)
+    row = np.where(visible, px[..., 1], np.inf)
     depth = p_camera[..., 2]
     order = np.argsort(depth, axis=-1, kind="stable")
     lowest = np.minimum.accumulate(np.take_along_axis(row, order, axis=-1), axis=-1)
     horizon = np.empty_like(row)
     np.put_along_axis(horizon, order, lowest, axis=-1)
     is_across = np.ptp(depth, axis=-1, keepdims=True) < 12.0
-    return px.numpy(), visible.numpy() & ((row <= horizon + 0.5) | is_across)
+    return px, visible & ((row <= horizon + 0.5) | is_across)
 
 
 def _is_sampled(

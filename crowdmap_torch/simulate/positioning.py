@@ -1,8 +1,9 @@
-"""The positioning module: true poses with a bias, a slow drift and white noise; its own sigmas."""
+"""The positioning module: true poses with a bias, a slow drift, white noise and outages; its own sigmas."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -10,10 +11,25 @@ from jaxtyping import Float
 from scipy.signal import lfilter
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.ranges import Degrees, Factor, LengthOrNone, Offset, Settings
+from crowdmap_torch.ranges import (
+    Degrees,
+    Factor,
+    LengthOrNone,
+    Offset,
+    Range,
+    Settings,
+    Share,
+    Span,
+)
 
 _DRIFT_STEP_M = 0.1
 """Way between the samples of a drift."""
+_TAIL_STEP_M = 10.0
+"""Way over which one draw of a heavy-tailed size holds."""
+_LARGEST_OUTAGE = 0.6
+"""Most of a drive that an outage takes."""
+FreedomOrNormal = Annotated[float, Range(0, 1e9, "degrees of freedom: 0 for a normal distribution")]
+Ratio = Annotated[float, Range(1, 1e3, "a factor either way: 1 for none")]
 
 
 @dataclass(frozen=True)
@@ -31,6 +47,10 @@ class PositioningConfig(Settings):
     drift_rot_deg: Degrees = 0.15
     """1-sigma of the drift of the rotation about each axis of the link."""
     drift_rot_length_m: LengthOrNone = 100.0
+    drift_smooth_m: LengthOrNone = 0.0
+    """Length over which either drift is smooth (a second-order Gauss-Markov process); 0: rough from frame to frame."""
+    drift_freedom: FreedomOrNormal = 0.0
+    """Student's degrees of freedom of either drift's steps of 10 m, more than 2; 0: normal steps."""
     white_e_m: LengthOrNone = 0.015
     """1-sigma of the noise from frame to frame, which goes on at a standstill."""
     white_n_m: LengthOrNone = 0.015
@@ -42,8 +62,23 @@ class PositioningConfig(Settings):
     shared_bias_u_m: Offset = 0.0
     sigma_scale: Factor = 1.0
     """What the module's own sigmas are multiplied with; other than 1 they are wrong."""
+    sigma_spread: Ratio = 1.0
+    """Each journey's sigmas are multiplied with a factor of their own, log-uniform from 1 / this to this."""
+    outages: Share = 0.0
+    """Probability that a drive has an outage: the position wanders off and comes back, and no sigma says so."""
+    outage_length_m: Span = (200.0, 400.0)
+    """Shortest and longest, at most 0.6 of the drive."""
+    outage_m: LengthOrNone = 3.0
+    """How far the position wanders off; that of an outage is half as far to half as far again."""
     sigmas: bool = True
     """False: the sigma columns are left out."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 < self.drift_freedom <= 2:
+            raise ValueError(
+                f"drift_freedom: expected more than 2 (with less there is no sigma) or 0, found {self.drift_freedom:g}"
+            )
 
 
 POSITIONING_PRESETS: dict[str, PositioningConfig] = {
@@ -62,6 +97,54 @@ class PoseError:
     """About the axes of the link [rad]."""
 
 
+@dataclass(frozen=True)
+class Outage:
+    """A stretch of a drive over which the position wanders off and comes back."""
+
+    from_m: float
+    """Way travelled where it begins."""
+    to_m: float
+    away_m: tuple[float, float, float]
+    """How far off the position is in the middle: east, north, up."""
+    sway_m: tuple[float, float, float]
+    """How far it sways on the way out, and to the other side on the way back."""
+
+    def shift(self, distance: Float[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
+        """Error of the position at the frames [m]: none, and without a kink, at both ends."""
+        share = np.clip((distance - self.from_m) / (self.to_m - self.from_m), 0.0, 1.0)
+        out = np.sin(np.pi * share)[:, None] ** 2
+        return out * (self.away_m + np.sin(2 * np.pi * share)[:, None] * self.sway_m)
+
+
+@dataclass(frozen=True)
+class DriveErrors:
+    """What is wrong with the positioning of one drive, and is not said."""
+
+    sigma_factor: float
+    """Stated sigmas are the true ones times this, and times `sigma_scale`."""
+    outage: Outage | None
+
+
+def drive_errors(
+    distance: Float[np.ndarray, " f"], config: PositioningConfig, rng: np.random.Generator
+) -> DriveErrors:
+    """A draw of one journey's; `distance` is the way travelled up to each frame."""
+    log_factor = np.log(config.sigma_spread) * rng.uniform(-1, 1)
+    has_outage = rng.random() < config.outages
+    length = min(rng.uniform(*config.outage_length_m), _LARGEST_OUTAGE * distance[-1])
+    begin = rng.uniform(0, distance[-1] - length)
+    size = config.outage_m * rng.uniform(0.5, 1.5)
+    angles = rng.uniform(0, 2 * np.pi, 2)
+    east, north = np.cos(angles), np.sin(angles)
+    up = 0.5 * rng.uniform(-1, 1, 2)
+    away, sway = (
+        (float(size * part * e), float(size * part * n), float(size * part * u))
+        for part, e, n, u in zip((1.0, 0.5), east, north, up, strict=True)
+    )
+    outage = Outage(float(begin), float(begin + length), away, sway)
+    return DriveErrors(float(np.exp(log_factor)), outage if has_outage and size > 0 else None)
+
+
 def pose_errors(
     distance: Float[np.ndarray, " f"], config: PositioningConfig, rng: np.random.Generator
 ) -> PoseError:
@@ -74,8 +157,10 @@ def pose_errors(
     shared = (config.shared_bias_e_m, config.shared_bias_n_m, config.shared_bias_u_m)
     white_sigma = (config.white_e_m, config.white_n_m, config.white_u_m)
     bias = np.array(shared) + rng.normal(size=3) * bias_sigma
-    drift = config.drift_m * _drift(distance, config.drift_length_m, rng)
-    turn = np.radians(config.drift_rot_deg) * _drift(distance, config.drift_rot_length_m, rng)
+    drift = config.drift_m * _drift(distance, config.drift_length_m, config, rng)
+    turn = np.radians(config.drift_rot_deg) * _drift(
+        distance, config.drift_rot_length_m, config, rng
+    )
     return PoseError(
         translation=bias + drift + rng.normal(size=(frames, 3)) * white_sigma,
         rotation=turn + np.radians(config.white_rot_deg) * rng.normal(size=(frames, 3)),
@@ -90,21 +175,29 @@ def measured_poses(
     return se3.retract(torch.from_numpy(T_world_link), xi).numpy()
 
 
-def reported_sigmas(config: PositioningConfig) -> tuple[Float[np.ndarray, " 3"], float] | None:
-    """The module's own 1-sigma of position (e, n, u) and rotation [rad]; None if it is silent."""
+def reported_sigmas(
+    config: PositioningConfig, errors: DriveErrors | None = None
+) -> tuple[Float[np.ndarray, " 3"], float] | None:
+    """The module's own 1-sigma of position (e, n, u) and rotation [rad] in a drive; None if it is silent."""
     if not config.sigmas:
         return None
     bias = np.array([config.bias_e_m, config.bias_n_m, config.bias_u_m])
     white = np.array([config.white_e_m, config.white_n_m, config.white_u_m])
     position = np.sqrt(bias**2 + config.drift_m**2 + white**2)
     rotation = np.radians(np.hypot(config.drift_rot_deg, config.white_rot_deg))
-    return config.sigma_scale * position, float(config.sigma_scale * rotation)
+    factor = config.sigma_scale * (1.0 if errors is None else errors.sigma_factor)
+    return factor * position, float(factor * rotation)
 
 
 def _drift(
-    distance: Float[np.ndarray, " f"], length: float, rng: np.random.Generator
+    distance: Float[np.ndarray, " f"],
+    length: float,
+    config: PositioningConfig,
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, "f 3"]:
     """A stationary Ornstein-Uhlenbeck process of unit variance along the way, in three axes."""
+    if config.drift_smooth_m or config.drift_freedom:
+        return _smooth_drift(distance, length, config, rng)
     samples = int(distance[-1] / _DRIFT_STEP_M) + 2
     keep = np.exp(-_DRIFT_STEP_M / length)
     push = rng.normal(size=(samples, 3)) * np.sqrt(1 - keep**2)
@@ -113,3 +206,27 @@ def _drift(
     )  # the first sample has the full variance: stationary from the start
     process = lfilter([1.0], [1.0, -keep], push, axis=0)
     return np.asarray(process)[np.rint(distance / _DRIFT_STEP_M).astype(np.int64)]
+
+
+def _smooth_drift(
+    distance: Float[np.ndarray, " f"],
+    length: float,
+    config: PositioningConfig,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "f 3"]:
+    """The same with pushes whose size is heavy-tailed from step to step, smoothed once more: of second order."""
+    keep = np.exp(-_DRIFT_STEP_M / length) if length else 0.0
+    smooth = np.exp(-_DRIFT_STEP_M / config.drift_smooth_m) if config.drift_smooth_m else 0.0
+    run_in = int(8 * (length + config.drift_smooth_m) / _DRIFT_STEP_M)
+    samples = run_in + int(distance[-1] / _DRIFT_STEP_M) + 2
+    push = rng.normal(size=(samples, 3))
+    if nu := config.drift_freedom:
+        # Student's t is a normal variable whose variance was drawn; with this scale it has unit variance.
+        step = np.arange(samples) // round(_TAIL_STEP_M / _DRIFT_STEP_M)
+        push *= np.sqrt((nu - 2) / rng.chisquare(nu, step[-1] + 1))[step, None]
+    variance = (1 + keep * smooth) / (
+        (1 - keep * smooth) * ((1 + keep * smooth) ** 2 - (keep + smooth) ** 2)
+    )
+    process = lfilter([1.0], [1.0, -(keep + smooth), keep * smooth], push, axis=0)
+    process = np.asarray(process)[run_in:] / np.sqrt(variance)
+    return process[np.rint(distance / _DRIFT_STEP_M).astype(np.int64)]

@@ -61,7 +61,7 @@ def build_rig(config: RigConfig, index: int, rng: np.random.Generator) -> Simula
     height = config.camera_height_m + rng.uniform(-0.05, 0.05)
     rpy = (roll, pitch, yaw)
     R_body_camera = rotation_from_rpy(*rpy) @ R_FORWARD_OPTICAL
-    rig_id = f"rig-{'abcdefghijklmnopqrstuvwxyz'[index % 26]}"
+    rig_id = f"rig-{letters(index)}"
     if index == 0:
         return SimulatedRig(rig_id, camera, R_body_camera, height, np.eye(4), None, None)
     forward, left = rng.uniform(1.4, 1.9), rng.uniform(-0.1, 0.1)
@@ -134,6 +134,15 @@ def _camera(config: RigConfig, rng: np.random.Generator) -> Camera:
     cy = (config.height - 1) / 2 + rng.uniform(-8, 8)
     K = torch.tensor([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
     return Camera(model, config.width, config.height, K, torch.from_numpy(distortion))
+
+
+def letters(index: int) -> str:
+    """The `index`-th of a, b, ..., z, aa, ab, ...: what rigs and vehicles are named by."""
+    name = ""
+    while index >= 0:
+        name = "abcdefghijklmnopqrstuvwxyz"[index % 26] + name
+        index = index // 26 - 1
+    return name
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "3 3"]:

@@ -49,6 +49,10 @@ class Road:
         """World points of the road surface."""
         return self._at(self.centre, station) + offset[..., None] * self._at(self.left, station)
 
+    def leftwards(self, station: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3"]:
+        """Unit vectors in the surface, to the left of those who drive along the stations."""
+        return self._at(self.left, station)
+
     def tangent_frame(
         self,
         station: Float[np.ndarray, "*batch"],

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from crowdmap_torch.ranges import (
     Degrees,
+    Duration,
     PixelsOrNone,
     PixelsSpan,
     Rate,
@@ -37,6 +38,12 @@ class SignDetectionConfig(Settings):
     """Box at which the noise is 1.41 times as large: `noise * sqrt(1 + (small_box / box)^2)`."""
     common_noise_px: PixelsOrNone = 0.0
     """1-sigma of a shift that all corners of a detection share."""
+    jitter_px: PixelsOrNone = 0.0
+    """1-sigma in u and in v of a shift of all corners of a sign's detection that lasts for a while."""
+    jitter_scale: Share = 0.0
+    """1-sigma of a share by which a detection is too large or too small for a while."""
+    jitter_s: Duration = 0.3
+    """Time after which the correlation of both has fallen to 1/e."""
     missed: Share = 0.06
     """Share of single detections that are missing."""
     occlusions: Share = 0.15

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 
 from crowdmap_torch.geometry import polygon
-from crowdmap_torch.geometry.camera import Camera, project
+from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.simulate.fleet import NO_ERRORS, VehicleErrors
+from crowdmap_torch.simulate.motion import Shutter
 from crowdmap_torch.simulate.sign_detections import (
     SignDetectionConfig,
     SignRows,
@@ -34,12 +35,18 @@ def detect_signs(
     rng: np.random.Generator,
     *,
     frame_rate_hz: float,
+    errors: VehicleErrors = NO_ERRORS,
 ) -> SignRows:
-    """All sign detections of a drive, frame after frame, in random order within a frame."""
-    frame, sign, corners = _visible(signs, drive, camera, config)
+    """All sign detections of a drive, frame after frame, in random order within a frame; `camera` is the true one."""
+    # Jitter has a stream of its own: without it everything else is drawn as with it.
+    (jitter_rng,) = rng.spawn(1)
+    frame, sign, corners = _visible(signs, Shutter(drive, camera, errors.read_out_s), config)
     kept = rng.random(len(frame)) >= config.missed
     kept &= ~_is_hidden(frame, sign, len(signs), config, rng, frame_rate_hz)
     frame, sign, corners = frame[kept], sign[kept], corners[kept]
+    corners = _with_habits(
+        corners, signs.shape[sign], drive.t[frame], sign, errors, config, jitter_rng
+    )
     twice = rng.random(len(frame)) < config.duplicates
     track = _tracks(frame, sign, config, rng)
     frame = np.concatenate((frame, frame[twice]))
@@ -79,10 +86,10 @@ def detect_signs(
 
 
 def _visible(
-    signs: WorldSigns, drive: Drive, camera: Camera, config: SignDetectionConfig
+    signs: WorldSigns, shutter: Shutter, config: SignDetectionConfig
 ) -> tuple[Int[np.ndarray, " d"], Int[np.ndarray, " d"], Float[np.ndarray, "d 8 2"]]:
     """Frame, sign and exact corners [px] of all that a perfect detector would see."""
-    corners_world = signs.corners()
+    corners_world, drive = signs.corners(), shutter.drive
     found = []
     for first in range(0, len(drive), _CHUNK_FRAMES):
         rows = slice(first, first + _CHUNK_FRAMES)
@@ -93,12 +100,56 @@ def _visible(
         facing = -np.einsum("fsk,sk->fs", ray, signs.normal) / np.maximum(distance, 1e-9)
         seen = (depth > config.range_m[0]) & (depth < config.range_m[1])
         frame, sign = np.nonzero(seen & (facing > np.cos(np.radians(config.view_angle_deg))))
-        p_camera = (corners_world[sign] - p[frame, None]) @ R[frame]
-        px, visible = project(camera, torch.from_numpy(p_camera))
-        whole = visible.all(-1).numpy() & (_boxes(px.numpy()).max(-1) >= config.min_box_px)
-        found.append((frame[whole] + first, sign[whole], px.numpy()[whole]))
+        frame = frame + first
+        _, px, visible = shutter.see(corners_world[sign], frame)
+        whole = visible.all(-1) & (_boxes(px).max(-1) >= config.min_box_px)
+        found.append((frame[whole], sign[whole], px[whole]))
     frame, sign, corners = (np.concatenate(column) for column in zip(*found, strict=True))
     return frame, sign, corners
+
+
+def _with_habits(
+    corners: Float[np.ndarray, "d 8 2"],
+    shape: Int[np.ndarray, " d"],
+    t: Float[np.ndarray, " d"],
+    sign: Int[np.ndarray, " d"],
+    errors: VehicleErrors,
+    config: SignDetectionConfig,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "d 8 2"]:
+    """Corners as this detector draws them: boxes too large, off to a side, and jittering; no noise of single corners."""
+    jitter = jitters(t, sign, config.jitter_s, rng)
+    count = _CORNERS[shape]
+    is_corner = np.arange(8)[None] < count[:, None]
+    middle = (corners * is_corner[..., None]).sum(1, keepdims=True) / count[:, None, None]
+    share = errors.box_share + config.jitter_scale * jitter[:, 2]
+    shift = np.array(errors.corner_px) + config.jitter_px * jitter[:, :2]
+    return corners + share[:, None, None] * (corners - middle) + shift[:, None]
+
+
+def jitters(
+    t: Float[np.ndarray, " d"],
+    sign: Int[np.ndarray, " d"],
+    memory_s: float,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "d 3"]:
+    """Three numbers for each detection, of unit variance, correlated by `exp(-dt / memory_s)` with those of its sign."""
+    push = rng.normal(size=(len(t), 3))
+    order = np.lexsort((t, sign))
+    t, sign = t[order], sign[order]
+    begins = np.ones(len(t), dtype=bool)
+    begins[1:] = sign[1:] != sign[:-1]
+    keep = np.where(begins, 0.0, np.exp(-np.diff(t, prepend=0.0).clip(0.0) / memory_s))
+    first = np.flatnonzero(begins)
+    place = np.arange(len(t)) - np.repeat(first, np.diff(np.append(first, len(t))))
+    jitter = push * np.sqrt(1 - keep**2)[:, None]
+    # All signs go on by one detection at a time.
+    by_place = np.argsort(place, kind="stable")
+    for row in np.split(by_place, np.cumsum(np.bincount(place)))[1:-1]:
+        jitter[row] += keep[row, None] * jitter[row - 1]
+    back = np.empty_like(jitter)
+    back[order] = jitter
+    return back
 
 
 def _is_hidden(

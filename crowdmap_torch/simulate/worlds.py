@@ -82,6 +82,18 @@ WORLD_PRESETS: dict[str, WorldConfig] = {
         exits_per_km=1.0,
         speed_mps=25.0,
     ),
+    "motorway": WorldConfig(
+        name="motorway",
+        road=RoadShape(heading_deg=0.0, grade=0.0, bank_deg=0.0),
+        signs=SignConfig(
+            posts_per_km=14.0, opposite_share=0.1, gantries_per_km=3.0, shared_share=0.15
+        ),
+        lane_width_m=(3.5, 3.7),
+        lanes_ahead=3,
+        lanes_back=0,
+        lights_per_km=0.0,
+        speed_mps=30.0,
+    ),
     "hills": WorldConfig(
         name="hills",
         road=RoadShape(

@@ -27,6 +27,17 @@ def test_every_number_of_a_preset_is_an_option(tmp_path: Path, capsys):
     assert "sigma_e" not in poses.column_names
 
 
+def test_errors_of_real_fleets_are_a_preset_whose_numbers_are_options(tmp_path: Path):
+    out = tmp_path / "data"
+    options = "--world street --length-m 100 --journeys 2 --frame-rate-hz 5 --errors mounts,clocks"
+    assert simulate(out, *options.split(), "--error-factor", 2, "--clock-error-s", 0.001) == 0
+    settings = json.loads((out / "survey" / "map.json").read_text())["provenance"]["settings"]
+    assert settings["fleet"]["mount_error_deg"] == 0.4 and settings["fleet"]["vehicles"] == 8
+    assert settings["fleet"]["clock_error_s"] == 0.001 and settings["fleet"]["focal_error"] == 0
+    vehicles = json.loads((out / "survey" / "truth" / "vehicles.json").read_text())
+    assert len(vehicles) == 8 and vehicles["vehicle-a"]["clock_s"] != 0
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -38,6 +49,8 @@ def test_every_number_of_a_preset_is_an_option(tmp_path: Path, capsys):
         ["--frame-rate-hz", "0"],
         ["--range-m", "80", "12"],
         ["--bad-drives", "flat-tyre"],
+        ["--errors", "rust"],
+        ["--clock-error-s", "2"],
         ["--camera", "lomo"],
     ],
     ids=lambda options: " ".join(options)[:30],

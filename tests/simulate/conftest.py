@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from crowdmap_torch.simulate.dataset import SimulationConfig, make_fleet, make_world
-from crowdmap_torch.simulate.rigs import SimulatedRig
+from crowdmap_torch.simulate.fleet import Vehicle
 from crowdmap_torch.simulate.worlds import WORLD_PRESETS, World
 
 
@@ -20,5 +20,5 @@ def suburb(suburb_config: SimulationConfig) -> World:
 
 
 @pytest.fixture(scope="session")
-def fleet(suburb_config: SimulationConfig) -> tuple[SimulatedRig, ...]:
+def fleet(suburb_config: SimulationConfig) -> tuple[Vehicle, ...]:
     return make_fleet(suburb_config)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,9 @@ from crowdmap_torch.geometry.camera import project
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import read_truth
-from crowdmap_torch.simulate.dataset import SimulationConfig, write_dataset
+from crowdmap_torch.simulate.dataset import SimulationConfig, make_fleet, write_dataset
+from crowdmap_torch.simulate.errors import with_errors
+from crowdmap_torch.simulate.fleet import FleetConfig
 from crowdmap_torch.simulate.rigs import RigConfig
 from crowdmap_torch.simulate.sign_detections import DAY, corner_sigma
 from crowdmap_torch.simulate.worlds import WORLD_PRESETS
@@ -55,6 +58,49 @@ def test_other_journeys_can_drive_in_the_same_world(small: Path, tmp_path: Path)
         assert (tmp_path / "other" / file).read_bytes() == (small / file).read_bytes()
     poses = "journeys/journey-000/poses.parquet"
     assert (tmp_path / "other" / poses).read_bytes() != (small / poses).read_bytes()
+
+
+def test_errors_of_no_size_leave_no_trace(small: Path, tmp_path: Path):
+    """Data sets keep their bytes: what is new draws from streams of its own and adds nothing where it is nothing."""
+    nothing = replace(
+        SMALL,
+        journeys=2,
+        fleet=FleetConfig(vehicles=3, one_detector=True),
+        positioning=replace(SMALL.positioning, outage_m=9.0),
+        signs=replace(SMALL.signs, jitter_s=0.1),
+    )
+    write_dataset(nothing, tmp_path / "nothing")
+    made, known = _bytes(tmp_path / "nothing"), _bytes(small)
+    told = ("survey/map.json", "survey/truth/drives.json", "survey/truth/bad_drives.json")
+    assert len(made) > 20
+    assert {name for name, content in made.items() if known[name] != content} <= set(told)
+
+
+def test_what_is_wrong_with_vehicles_and_drives_is_kept_as_truth(tmp_path: Path):
+    config = with_errors(replace(SMALL, journeys=4), ["fleet"])
+    config = replace(config, fleet=replace(config.fleet, vehicles=2), seed=7)
+    config = replace(config, positioning=replace(config.positioning, outages=0.5))
+    write_dataset(config, tmp_path / "data")
+    truth = tmp_path / "data" / "survey" / "truth"
+    vehicles = json.loads((truth / "vehicles.json").read_text())
+    for vehicle in make_fleet(config):
+        told = vehicles[vehicle.vehicle_id]
+        assert told.pop("rig") == vehicle.rig.rig_id
+        assert told == json.loads(json.dumps(asdict(vehicle.errors)))
+    drives = json.loads((truth / "drives.json").read_text())
+    right = SMALL.positioning
+    sigma = np.sqrt(right.bias_e_m**2 + right.drift_m**2 + right.white_e_m**2)
+    for name, drive in drives.items():
+        folder = tmp_path / "data" / "journeys" / name
+        journey = json.loads((folder / "journey.json").read_text())
+        assert drive["vehicle_id"] == journey["vehicle_id"]
+        assert vehicles.keys() >= {journey["vehicle_id"]}
+        poses = pq.read_table(folder / "poses.parquet")
+        assert poses["sigma_e"][0].as_py() == pytest.approx(drive["sigma_factor"] * sigma)
+    assert len(drives) == 4 and len({d["vehicle_id"] for d in drives.values()}) == 2
+    outages = [drive["outage"] for drive in drives.values()]
+    assert any(outages) and not all(outages)
+    assert not load_dataset(tmp_path / "data", strict=True).rejected
 
 
 def test_the_reader_takes_every_journey(small: Path):

@@ -8,6 +8,7 @@ import pytest
 from crowdmap_torch.simulate.positioning import (
     POSITIONING_PRESETS,
     PositioningConfig,
+    drive_errors,
     measured_poses,
     pose_errors,
     reported_sigmas,
@@ -95,3 +96,82 @@ def test_measured_pose_is_the_true_one_moved_along_world_axes_and_turned_about_i
     # Errors of a few milliradians: the rotation matrix is I + skew(w) up to w^2 / 2, 1e-5.
     np.testing.assert_allclose(turn[:, 2, 1], error.rotation[:, 0], atol=1e-4)
     np.testing.assert_allclose(turn[:, 1, 0], error.rotation[:, 2], atol=1e-4)
+
+
+def _drift(config: PositioningConfig, draws: int, distance: np.ndarray) -> np.ndarray:
+    """The drift alone of many journeys: draw, frame, axis."""
+    quiet = {f"{kind}_{axis}_m": 0.0 for kind in ("bias", "white") for axis in "enu"}
+    errors = _errors(replace(config, **quiet), draws, distance)
+    return np.array([e.translation for e in errors])
+
+
+@pytest.mark.parametrize("freedom", [0.0, 4.0])
+def test_a_smooth_drift_has_the_same_sigma_and_no_rough_steps(freedom: float):
+    smooth = replace(PAPER, drift_smooth_m=20.0, drift_freedom=freedom)
+    distance = np.array([0.0, 1.0, 40.0, 300.0])
+    drift, rough = _drift(smooth, 700, distance), _drift(PAPER, 700, distance)
+    # 2100 draws of a normal variable: 1.5 % of a standard deviation; heavier tails are known less well.
+    np.testing.assert_allclose(drift.std((0, 2)), PAPER.drift_m, rtol=0.12)
+    step, rough_step = (np.diff(d[:, :2], axis=1).std() for d in (drift, rough))
+    # Rough: sqrt(2 / 150) of the sigma for a metre; smooth: 1 / sqrt(20 * 150).
+    assert rough_step == pytest.approx(PAPER.drift_m * np.sqrt(2 / 150), rel=0.1)
+    assert step == pytest.approx(PAPER.drift_m / np.sqrt(20 * 150), rel=0.15)
+
+
+def test_a_drift_of_few_degrees_of_freedom_takes_large_steps_now_and_then():
+    def excess(freedom: float) -> float:
+        config = replace(PAPER, drift_smooth_m=10.0, drift_freedom=freedom)
+        step = np.diff(_drift(config, 12, np.arange(0.0, 2000.0, 10.0)), axis=1)
+        return float((step**4).mean() / (step**2).mean() ** 2 - 3)
+
+    assert abs(excess(0.0)) < 0.3
+    assert excess(3.0) > 1.0
+
+
+def test_tails_without_a_variance_are_refused():
+    with pytest.raises(ValueError, match="drift_freedom: expected more than 2"):
+        replace(PAPER, drift_freedom=1.5)
+
+
+def test_an_outage_takes_metres_for_some_hundred_and_comes_back():
+    config = replace(PAPER, outages=1.0)
+    distance = np.arange(0.0, 1000.0, 0.5)
+    for seed in range(20):
+        outage = drive_errors(distance, config, np.random.default_rng(seed)).outage
+        assert outage is not None
+        assert 200 <= outage.to_m - outage.from_m <= 400
+        shift = outage.shift(distance)
+        inside = (distance > outage.from_m) & (distance < outage.to_m)
+        assert np.abs(shift[~inside]).max() < 1e-12
+        size = np.linalg.norm(shift, axis=-1)
+        assert 0.4 * config.outage_m < size.max() < 2.5 * config.outage_m
+        # No jump, and no kink either: half a metre further the slope has changed by a thousandth.
+        assert np.linalg.norm(np.diff(shift, axis=0), axis=-1).max() < 0.06
+        assert np.linalg.norm(np.diff(shift, 2, axis=0), axis=-1).max() < 1.5e-3
+
+
+def test_outages_come_as_often_as_asked_for_and_fit_into_short_drives():
+    config = replace(PAPER, outages=0.1)
+    drawn = [
+        drive_errors(np.array([0.0, 100.0]), config, np.random.default_rng(k)) for k in range(2000)
+    ]
+    outages = [d.outage for d in drawn if d.outage is not None]
+    assert len(outages) / 2000 == pytest.approx(0.1, abs=0.03)
+    assert all(0 <= o.from_m and o.to_m <= 100 and o.to_m - o.from_m <= 60 + 1e-9 for o in outages)
+
+
+def test_stated_sigmas_are_off_by_a_factor_either_way():
+    config = replace(PAPER, sigma_spread=1.5)
+    drawn = [
+        drive_errors(np.array([0.0, 100.0]), config, np.random.default_rng(k)) for k in range(500)
+    ]
+    logs = np.log([d.sigma_factor for d in drawn]) / np.log(1.5)
+    assert logs.min() >= -1 and logs.max() <= 1
+    # Uniform from -1 to 1: 1-sigma of 0.577.
+    assert logs.mean() == pytest.approx(0.0, abs=0.1) and logs.std() == pytest.approx(
+        0.577, abs=0.05
+    )
+    position, turn = reported_sigmas(config)  # type: ignore[misc]
+    off, off_turn = reported_sigmas(config, drawn[0])  # type: ignore[misc]
+    np.testing.assert_allclose(off, drawn[0].sigma_factor * position)
+    assert off_turn == pytest.approx(drawn[0].sigma_factor * turn)

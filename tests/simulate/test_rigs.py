@@ -9,7 +9,7 @@ import torch
 
 from crowdmap_torch.io.rigs import read_rig
 from crowdmap_torch.simulate.files import write_rig
-from crowdmap_torch.simulate.rigs import RigConfig, build_rig, rotation_from_rpy
+from crowdmap_torch.simulate.rigs import RigConfig, build_rig, letters, rotation_from_rpy
 
 
 @pytest.mark.parametrize("index", range(3))
@@ -24,6 +24,13 @@ def test_a_rig_comes_back_from_its_files(tmp_path: Path, camera: str, index: int
     # Through the chain of a URDF's joints: rounding of float64.
     assert np.abs(read.T_link_camera.numpy() - rig.T_link_camera).max() < 1e-12
     assert np.abs(read.road_normal_camera.numpy() - rig.road_normal_camera).max() < 1e-12
+
+
+def test_no_two_rigs_have_one_name():
+    assert [letters(index) for index in (0, 1, 25, 26, 27, 52, 702)] == [
+        *("a", "b", "z", "aa", "ab", "ba", "aaa")
+    ]
+    assert len({letters(index) for index in range(2000)}) == 2000
 
 
 def test_the_first_rig_has_no_mount_and_the_others_differ_in_their_pose_links():

@@ -17,6 +17,15 @@ def road(request) -> Road:
     return build(shape, 600.0, _rng())
 
 
+def test_leftwards_is_where_offsets_grow(road: Road):
+    station = np.linspace(0, road.length, 20)
+    left = road.leftwards(station)
+    step = road.surface(station, np.ones(20)) - road.surface(station, np.zeros(20))
+    assert np.abs(left - step).max() < 1e-12
+    # Between samples of the centre line it is the mean of two of them: 0.1 m of a 15 m curve.
+    assert np.abs(np.linalg.norm(left, axis=-1) - 1).max() < 1e-4
+
+
 def test_tangent_frame_agrees_with_the_surface(road: Road):
     rng = _rng(1)
     station, offset = rng.uniform(20, road.length - 20, 200), rng.uniform(-8, 8, 200)

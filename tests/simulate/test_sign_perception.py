@@ -11,7 +11,7 @@ from crowdmap_torch.geometry.camera import project
 from crowdmap_torch.simulate.dataset import DETECTION_PRESETS, SimulationConfig
 from crowdmap_torch.simulate.rigs import RigConfig, build_rig
 from crowdmap_torch.simulate.sign_detections import DAY, corner_sigma
-from crowdmap_torch.simulate.sign_perception import detect_signs
+from crowdmap_torch.simulate.sign_perception import detect_signs, jitters
 from crowdmap_torch.simulate.vehicle import VehicleConfig, drive_through
 from crowdmap_torch.simulate.worlds import WORLD_PRESETS
 
@@ -156,4 +156,40 @@ def test_detections_do_not_depend_on_how_frames_are_cut_into_chunks(
 def test_default_detection_is_day():
     assert SimulationConfig().signs == DETECTION_PRESETS["day"][0]
     assert DETECTION_PRESETS["night"][0].missed == 0.35
-    assert set(WORLD_PRESETS) == {"street", "suburb", "highway", "hills", "block"}
+    assert set(WORLD_PRESETS) == {"street", "suburb", "highway", "motorway", "hills", "block"}
+
+
+def test_jitter_has_unit_variance_and_is_forgotten_in_its_time():
+    count, dt, memory = 4000, 0.1, 0.3
+    t, sign = np.tile(np.arange(7) * dt, count), np.repeat(np.arange(count), 7)
+    mixed = np.random.default_rng(1).permutation(len(t))
+    found = np.empty((len(t), 3))
+    found[mixed] = jitters(t[mixed], sign[mixed], memory, np.random.default_rng(0))
+    found = found.reshape(count, 7, 3)
+    # 12,000 pairs: a correlation is known to 0.01.
+    for lag in (0, 1, 3, 6):
+        product = (found[:, 0] * found[:, lag]).mean()
+        assert product == pytest.approx(np.exp(-lag * dt / memory), abs=0.04)
+    assert abs((found[:-1, 3] * found[1:, 3]).mean()) < 0.04
+    assert abs((found[..., 0] * found[..., 1]).mean()) < 0.04
+
+
+def test_jitter_moves_and_scales_all_corners_of_a_detection_alike(suburb, drive, rig):
+    steady = _detect(suburb, drive, rig, PERFECT)
+    shifted = _detect(suburb, drive, rig, replace(PERFECT, jitter_px=0.7))
+    assert np.array_equal(steady.frame, shifted.frame)
+    shift = shifted.corners_px - steady.corners_px
+    assert np.ptp(shift, axis=1).max() < 1e-9
+    # Some 60 signs a second or two long: a few hundred independent draws.
+    assert shift[:, 0].std() == pytest.approx(0.7, rel=0.2)
+    scaled = _detect(suburb, drive, rig, replace(PERFECT, jitter_scale=0.01))
+    growth = np.ptp(scaled.corners_px, axis=1) / np.ptp(steady.corners_px, axis=1) - 1
+    assert np.abs(growth[:, 0] - growth[:, 1]).max() < 1e-9
+    assert growth[:, 0].std() == pytest.approx(0.01, rel=0.25)
+
+
+def test_jitter_changes_nothing_else_that_is_drawn(suburb, drive, rig):
+    steady = _detect(suburb, drive, rig, DAY)
+    jittering = _detect(suburb, drive, rig, replace(DAY, jitter_px=1e-6))
+    assert np.array_equal(steady.code, jittering.code)
+    assert np.abs(steady.corners_px - jittering.corners_px).max() < 1e-4
