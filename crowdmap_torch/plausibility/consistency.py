@@ -31,7 +31,7 @@ class ConsistencyLimits:
     least_parallax_deg: float = 3.0
     """Root mean square angle between its rays."""
     better: float = 0.75
-    """Misfit under another lens against that of what is given, in the median over journeys."""
+    """Misfit under another order of the lens's coefficients against that of what is given, in the median over journeys."""
     better_shifted: float = 0.93
     """The same of frames shifted: less will do, since the best of several shifts is the same in most journeys."""
     agreeing: float = 0.8
@@ -226,20 +226,7 @@ def _instead(
             ),
         )
     lens = camera.distortion
-    if not bool((lens != 0).any()):
-        return
-    yield (
-        "undistorted",
-        replace(camera, distortion=torch.zeros_like(lens)),
-        0,
-        Finding(
-            "undistorted",
-            "the lens has no distortion",
-            "detections are in undistorted pixels",
-            "write raw pixels, or a rig without distortion",
-        ),
-    )
-    if camera.model == "brown_conrady" and len(lens) >= 4:
+    if camera.model == "brown_conrady" and bool((lens != 0).any()):
         k1, k2, *rest = (*lens.tolist(), 0.0)[:5]
         order = lens.new_tensor([k1, k2, rest[1], rest[2], rest[0]])
         yield (

@@ -14,6 +14,7 @@ from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.plausibility.consistency import consistency_findings
 from crowdmap_torch.plausibility.detections import Outlines, detection_findings
 from crowdmap_torch.plausibility.finding import Finding, gathered
+from crowdmap_torch.plausibility.lens import lens_findings
 from crowdmap_torch.plausibility.poses import pose_findings
 from crowdmap_torch.plausibility.rig import rig_findings
 from crowdmap_torch.tables import Dataset, Journey
@@ -42,9 +43,11 @@ def look_over(
     sound = [j for j in dataset.journeys if j.journey_id not in spoiled and len(j.signs)]
     some = sound[:: -(-len(sound) // _MOST_TRIANGULATED)] if sound else []
     tracklets = [associate_signs(journey, positioning, config) for journey in some]
-    names = [journey.journey_id for journey in some]
-    found += [
-        (name, finding) for finding in consistency_findings(some, tracklets) for name in names
+    # What is wrong with the lens keeps rays from meeting, too.
+    found += lens_findings(some, tracklets, positioning) or [
+        (journey.journey_id, finding)
+        for finding in consistency_findings(some, tracklets)
+        for journey in some
     ]
     return gathered(found)
 

@@ -65,19 +65,6 @@ def test_frames_that_are_numbered_late_are_named_with_how_many(late: int) -> Non
     assert f"{abs(late)} frames {'earlier' if late > 0 else 'later'}" in finding.evidence
 
 
-def test_pixels_without_the_lens_of_the_rig_are_named() -> None:
-    bent = replace(RIG, camera=replace(CAMERA, distortion=torch.zeros_like(LENS)))
-    drives = []
-    for seed in range(5):
-        journey, tracks = drive(seed)
-        ideal = journey.signs.corners_ideal
-        px = ideal @ K[:2, :2] + K[:2, 2]
-        drives.append((replace(journey, signs=replace(journey.signs, corners_px=px)), tracks))
-    (finding,) = found(drives)
-    assert finding.kind == "undistorted"
-    assert found([(replace(j, rig=bent), t) for j, t in drives]) == []
-
-
 def test_a_lever_arm_is_named_with_its_length() -> None:
     lever = torch.tensor([0.2, -0.5, -1.5]).double()
     (finding,) = found([drive(seed, lever=lever) for seed in range(5)])

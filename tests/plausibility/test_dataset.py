@@ -9,10 +9,7 @@ from worlds.mistakes import MISTAKES
 from crowdmap_torch.plausibility.finding import Finding
 
 Look = Callable[[Path], dict[str, Finding]]
-NOT_FOUND = {
-    "undistorted": "an error of the lens hides behind the drift of the poses",
-    "lever-arm": "what four drives show of it is mostly the drift of their poses",
-}
+NOT_FOUND = {"lever-arm": "what four drives show of it is mostly the drift of their poses"}
 """Mistakes that a look at so few short drives does not name, and why."""
 
 

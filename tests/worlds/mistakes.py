@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -161,27 +162,40 @@ def _coco(folder: Path) -> None:
     _pixels(_boxes, lanes=False)(folder)
 
 
-def _undistorted(folder: Path) -> None:
-    """Detections in undistorted pixels of the same intrinsics."""
+def _through(folder: Path, lens: list[float]) -> None:
+    """Detections in pixels of the rigs' intrinsics with another distortion; the rigs stay as they are."""
     import torch
 
-    from crowdmap_torch.geometry.camera import unproject
+    from crowdmap_torch.geometry.camera import distort, unproject
     from crowdmap_torch.io.rigs import read_rig
 
     for path in sorted(folder.glob("journeys/*/journey.json")):
-        rig = read_rig(folder / "rigs" / json.loads(path.read_text())["rig"])
-        K = rig.camera.K.numpy()
+        camera = read_rig(folder / "rigs" / json.loads(path.read_text())["rig"]).camera
+        other = replace(camera, model="brown_conrady", distortion=camera.K.new_tensor(lens))
         for name in ("signs", "lanes"):
             file = path.parent / f"{name}.parquet"
             table = pq.read_table(file)
             c = table.to_pydict()
             count = [len(u) for u in c["u"]]
             flat = np.stack((np.concatenate(c["u"]), np.concatenate(c["v"])), -1)
-            ideal, _ = unproject(rig.camera, torch.from_numpy(flat).double())
-            px = np.split(ideal.numpy() @ K[:2, :2].T + K[:2, 2], np.cumsum(count)[:-1])
+            ideal, _ = unproject(camera, torch.from_numpy(flat).double())
+            px = np.split(distort(other, ideal).numpy(), np.cumsum(count)[:-1])
             c |= {"u": [p[:, 0].tolist() for p in px], "v": [p[:, 1].tolist() for p in px]}
             arrays = {k: pa.array(x, table.schema.field(k).type) for k, x in c.items()}
             pq.write_table(pa.table(arrays), file)
+
+
+def _with_lens(folder: Path, lens: list[float]) -> None:
+    """Rigs with another distortion; detections stay as they are."""
+    _rigs(folder, lambda rig: rig["camera"].update(distortion=lens))
+
+
+def relensed(good: Path, bad: Path, lens: list[float]) -> Path:
+    """A copy of a data set as if all its cameras had another distortion."""
+    shutil.copytree(good, bad)
+    _through(bad, lens)
+    _with_lens(bad, lens)
+    return bad
 
 
 def _coefficients(rig: dict) -> None:
@@ -245,7 +259,8 @@ MISTAKES: dict[str, Callable[[Path], None]] = {
     "image-size": _pixels(lambda u, v, camera: (u / 2, v / 2)),
     "anticlockwise": _pixels(lambda u, v, camera: (u[::-1], v[::-1]), lanes=False),
     "boxes": _coco,
-    "undistorted": _undistorted,
+    "undistorted": lambda folder: _through(folder, []),
+    "no-lens": lambda folder: _with_lens(folder, []),
     "coefficient-order": lambda folder: _rigs(folder, _coefficients),
     "frame-offset": _frames_off,
     "lever-arm": _poses(lambda R, p: (R, p + R @ _ANTENNA)),

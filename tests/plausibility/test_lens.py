@@ -1,0 +1,98 @@
+"""Pixels with and without the lens of their rig, in drives whose poses drift and whose detections are noisy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from worlds.mistakes import relensed, spoiled
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.plausibility.finding import Finding
+from crowdmap_torch.plausibility.lens import LensLimits, MissingLens, lens_findings, missing_lens
+from crowdmap_torch.tables import Journey, Tracklets
+from crowdmap_torch.tracking.signs import associate_signs
+
+MILD = [-0.08, 0.01, 0.0, 0.0]
+CONFIG = MapperConfig()
+
+
+def tracked(journeys: Sequence[Journey]) -> list[Tracklets]:
+    return [associate_signs(j, CONFIG.positioning, CONFIG.sign_association) for j in journeys]
+
+
+def found(folder: Path) -> list[tuple[str, Finding]]:
+    journeys = load_dataset(folder).journeys
+    return lens_findings(journeys, tracked(journeys), CONFIG.positioning)
+
+
+def without_lens(camera: Camera) -> Camera:
+    return replace(camera, model="brown_conrady", distortion=camera.K.new_zeros(0))
+
+
+def missing(journey: Journey, tracks: Tracklets) -> MissingLens:
+    other = without_lens(journey.rig.camera)
+    result = missing_lens(journey, tracks, other, CONFIG.positioning, LensLimits())
+    assert result is not None
+    return result
+
+
+def test_a_mild_lens_is_told_from_none(good: Path, tmp_path: Path) -> None:
+    raw = relensed(good, tmp_path / "raw", MILD)
+    assert found(raw) == []
+    named = found(spoiled(raw, tmp_path / "bad", "undistorted"))
+    assert {finding.kind for _, finding in named} == {"undistorted"}
+    assert len(named) == 4
+
+
+def test_raw_pixels_of_a_rig_without_distortion_are_named_with_the_lens(
+    good: Path, spoil: Callable[[str], Path]
+) -> None:
+    named = found(spoil("no-lens"))
+    assert {finding.kind for _, finding in named} == {"no-lens"}
+    # The simulator's lens: -0.12, within a tenth.
+    k1 = float(named[0][1].evidence.split("k1 = ")[1].split()[0])
+    assert -0.14 <= k1 <= -0.09
+
+
+def test_undistorted_pixels_of_a_rig_without_distortion_are_right(
+    spoil: Callable[[str], Path], tmp_path: Path
+) -> None:
+    bare = spoiled(spoil("undistorted"), tmp_path / "bare", "no-lens")
+    assert found(bare) == []
+
+
+def test_noise_of_pixels_does_not_make_a_lens_stronger(good: Path) -> None:
+    # Errors of undistorted pixels would: a share of 0.1 of a lens of -0.12 for each pixel of noise.
+    journeys = load_dataset(good).journeys[:2]
+    generator = torch.Generator().manual_seed(0)
+    for journey, tracks in zip(journeys, tracked(journeys), strict=True):
+        px = journey.signs.corners_px
+        noisy = px + 1.5 * torch.randn(px.shape, generator=generator, dtype=px.dtype)
+        result = missing(replace(journey, signs=replace(journey.signs, corners_px=noisy)), tracks)
+        assert abs(result.share) < max(0.25, 4 * result.sigma)
+
+
+def test_drives_that_tell_nothing_are_passed_over(good: Path) -> None:
+    journeys = load_dataset(good).journeys
+    nothing = [Tracklets(torch.full_like(j.signs.frame, -1), 0) for j in journeys]
+    assert lens_findings(journeys, nothing, CONFIG.positioning) == []
+    assert lens_findings([], [], CONFIG.positioning) == []
+
+
+@pytest.mark.parametrize("shares", [(0.0, 1.0, 0.0, 1.0), (1.0, 1.0, 1.0, -1.0)])
+def test_drives_that_contradict_each_other_do_not_decide(
+    shares: tuple[float, ...], monkeypatch: pytest.MonkeyPatch, good: Path
+) -> None:
+    journeys = load_dataset(good).journeys
+    nothing = [Tracklets(torch.full_like(j.signs.frame, -1), 0) for j in journeys]
+    said = iter(shares)
+    monkeypatch.setattr(
+        "crowdmap_torch.plausibility.lens.missing_lens", lambda *_: MissingLens(next(said), 0.05)
+    )
+    assert lens_findings(journeys, nothing, CONFIG.positioning) == []
