@@ -98,12 +98,70 @@ def test_single_precision_comes_to_its_own_rounding():
     assert torch.allclose(found.values.double(), expected, rtol=0, atol=6e-6)
 
 
-def test_what_does_not_converge_is_an_error(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(eigenpairs, "_MOST_ROUNDS", 2)
-    with pytest.raises(
-        ArithmeticError, match=r"400 nodes: residuals of up to .*`dense_limit` to 400"
-    ):
-        leading_eigenpairs(symmetric_graph(*scattered(400, 8)), COUNT, crowded_below=0)
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_does_not_converge_is_decomposed_whole(kind: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(eigenpairs, "_MOST_ROUNDS", 1)
+    graph = symmetric_graph(*KINDS[kind]())
+    found = leading_eigenpairs(graph, COUNT, crowded_below=0)
+    expected = torch.linalg.eigvalsh(laplacian(graph))[:COUNT]
+    # One round is enough for a clique alone, whose spectrum has one value behind the first.
+    assert torch.allclose(found.values, expected, rtol=0, atol=1e-10)
+
+
+def cut_short(monkeypatch: pytest.MonkeyPatch, *, rounds: int, last_whole: int) -> list[int]:
+    """Few rounds, and no graph small enough to be decomposed at once; the widths that are tried."""
+    widths: list[int] = []
+    iterated = eigenpairs._iterated
+
+    def counted(graph: Graph, product: eigenpairs.Product, count: int, width: int, below: float):
+        widths.append(width)
+        return iterated(graph, product, count, width, below)
+
+    monkeypatch.setattr(eigenpairs, "_iterated", counted)
+    monkeypatch.setattr(eigenpairs, "_MOST_ROUNDS", rounds)
+    monkeypatch.setattr(eigenpairs, "_SOON_WHOLE", 0)
+    monkeypatch.setattr(eigenpairs, "_LAST_WHOLE", last_whole)
+    return widths
+
+
+def test_a_wider_block_converges_where_a_narrow_one_does_not(monkeypatch: pytest.MonkeyPatch):
+    # Behind twelve clusters come 228 eigenvalues close together: blocks of 36 and 84 are in their midst, one of 240 is not.
+    widths = cut_short(monkeypatch, rounds=4, last_whole=0)
+    graph = symmetric_graph(*KINDS["cliques"]())
+    found = leading_eigenpairs(graph, COUNT, crowded_below=0)
+    assert widths == [COUNT + 16, COUNT + 4 * 16, COUNT + 16 * 16]
+    expected = torch.linalg.eigvalsh(laplacian(graph))[:COUNT]
+    assert torch.allclose(found.values, expected, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_best_vectors_of_a_graph_too_large_are_orthonormal_and_near(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+):
+    cut_short(monkeypatch, rounds=2, last_whole=0)
+    graph = symmetric_graph(*KINDS[kind]())
+    found = leading_eigenpairs(graph, COUNT, crowded_below=0)
+    assert found.values.isfinite().all() and bool((found.values.diff() >= 0).all())
+    width = found.vectors.shape[1]
+    inner = found.vectors.T @ found.vectors
+    assert torch.allclose(inner, torch.eye(width).double(), rtol=0, atol=1e-10)
+    # Ritz values are no smaller than the eigenvalues.
+    expected = torch.linalg.eigvalsh(laplacian(graph))[:COUNT]
+    assert bool((found.values >= expected - 1e-10).all())
+
+
+@pytest.mark.parametrize("last_whole", [0, 1 << 13])
+def test_clusters_are_found_though_no_iteration_converges(
+    last_whole: int, monkeypatch: pytest.MonkeyPatch
+):
+    config = SpectralConfig(dense_limit=60, leading=COUNT, cut_below=1e-6)
+    graphs = parted(KINDS["cliques"](), KINDS["clique"](), path(1), path(2))
+    expected = cluster_graph(*graphs, config)
+    assert expected.count == 12 + 1 + 1 + 1
+    widths = cut_short(monkeypatch, rounds=2, last_whole=last_whole)
+    found = cluster_graph(*graphs, config)
+    assert len(widths) > 2
+    assert torch.equal(found.label, expected.label)
 
 
 @pytest.mark.parametrize(
