@@ -11,8 +11,8 @@ road, the normal is `tilt + slope`, and on the average it is the stance:
     chord     = slope averaged over the last metres         after every stretch of travel
     width     = roll                                        after every longer stretch with lanes side by side
 
-What measurements need of frames is computed ahead in one batch (`take_measurements`); left to the
-loop are products of 6 x 6 matrices.
+What measurements need of frames is computed ahead in one batch (`take_measurements`). What frame after frame does to a
+state is put together by an associative scan (Sarkka and Garcia-Fernandez 2021), so that no loop walks over frames.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from crowdmap_torch.geometry.associative_scan import Elements, associative_scan
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.ranges import Deviations, Settings, Sigma
 
@@ -31,6 +32,8 @@ SLOPE, GROWTH, STANCE, CROSS, TWIST, ROLL = range(6)
 STATE_SIZE = 6
 MISSING = 1e6
 """Variance of a measurement that is not there."""
+_SETTLED = 1e-12
+"""What measurements are trusted may still move by this share of it in the last round of a filter."""
 
 
 @dataclass(frozen=True)
@@ -104,31 +107,34 @@ def filter_forward(
 ) -> Filtered:
     """The causal estimates of frames that follow on `start` (Kalman 1960; outliers as in Huber 1964).
 
-    The last one is the `start` of the frames after them.
+    The last one is the `start` of the frames after them. How far a measurement is trusted depends on what the frames
+    before it predict: those of a round are judged by the predictions of the round before, until nothing moves any more.
+    After k rounds the first k frames are right whatever comes; two or three rounds do for a drive.
     """
-    F = _transitions(measurements)
-    Q = _process_noise(measurements, positioning, config)
-    x, P = start.mean, start.covariance
-    kept = []
-    for k in range(len(measurements)):
-        x, P = F[k] @ x, F[k] @ P @ F[k].T + Q[k]
-        before = (x, P)
-        H = measurements.row[k]
-        PH = P @ H.T
-        innovation = measurements.value[k] - (H + measurements.known[k]) @ x
-        S = H @ PH
-        R = measurements.variance[k]
-        excess = innovation.abs() / (config.gate * (S.diagonal() + R).sqrt())
-        S = S + torch.diag(R * excess.clamp_min(1).square())
-        gain = torch.linalg.solve_ex(S, PH.T)[0].T
-        x, P = x + gain @ innovation, P - gain @ PH.T
-        P = 0.5 * (P + P.T)
-        kept.append((x, P, *before))
-    if not kept:
-        empty = RoadState(x.new_zeros(0, STATE_SIZE), x.new_zeros(0, STATE_SIZE, STATE_SIZE))
-        return Filtered(empty, empty, F)
-    x, P, x_before, P_before = (torch.stack(column) for column in zip(*kept, strict=True))
-    return Filtered(RoadState(x, P), RoadState(x_before, P_before), F)
+    m, F = measurements, _transitions(measurements)
+    Q = _process_noise(m, positioning, config)
+    first = RoadState(F[:1] @ start.mean, F[:1] @ start.covariance @ F[:1].mT + Q[:1])
+    expected = first.mean.expand(len(m), -1)
+    inflation = torch.ones_like(m.variance)
+    state = predicted = first
+    for _ in range(len(m) + 1 if len(m) else 0):
+        value = m.value - (m.known @ expected[..., None])[..., 0]
+        steps = _filter_steps(F, Q, m.row, value, m.variance * inflation, first)
+        state = RoadState(*associative_scan(_one_after_another, steps)[1:3])
+        x, P = state.mean[:-1, :, None], state.covariance[:-1]
+        predicted = RoadState(
+            torch.cat((first.mean, (F[1:] @ x)[..., 0])),
+            torch.cat((first.covariance, F[1:] @ P @ F[1:].mT + Q[1:])),
+        )
+        before, inflation = inflation, _inflation(m, predicted, config)
+        moved = (m.known @ (predicted.mean - expected)[..., None])[..., 0]
+        expected = predicted.mean
+        tolerance = _SETTLED * (1 + m.value.abs())
+        if bool(((inflation - before).abs() <= _SETTLED * before).all()) and bool(
+            (moved.abs() <= tolerance).all()
+        ):
+            break
+    return Filtered(state, predicted, F)
 
 
 def smooth_backward(filtered: Filtered) -> RoadState:
@@ -142,11 +148,78 @@ def smooth_backward(filtered: Filtered) -> RoadState:
     scale = P_next.diagonal(dim1=-2, dim2=-1).rsqrt()
     scaled = scale[:, :, None] * P_next * scale[:, None, :]
     G = (scale[:, :, None] * torch.linalg.solve(scaled, scale[:, :, None] * FP)).mT
-    mean, covariance = [x[-1]], [P[-1]]
-    for k in range(len(G) - 1, -1, -1):
-        mean.append(x[k] + G[k] @ (mean[-1] - x_next[k]))
-        covariance.append(P[k] + G[k] @ (covariance[-1] - P_next[k]) @ G[k].T)
-    return RoadState(torch.stack(mean[::-1]), torch.stack(covariance[::-1]))
+    G = torch.cat((G, torch.zeros_like(P[-1:])))
+    shift = torch.cat((x[:-1] - (G[:-1] @ x_next[..., None])[..., 0], x[-1:]))
+    spread = torch.cat((P[:-1] - G[:-1] @ P_next @ G[:-1].mT, P[-1:]))
+    backwards = tuple(t.flip(0) for t in (G, shift, spread))
+    _, mean, covariance = associative_scan(_one_before_another, backwards)
+    return RoadState(mean.flip(0), covariance.flip(0))
+
+
+def _filter_steps(
+    F: Float[Tensor, "f 6 6"],
+    Q: Float[Tensor, "f 6 6"],
+    H: Float[Tensor, "f s 6"],
+    value: Float[Tensor, "f s"],
+    variance: Float[Tensor, "f s"],
+    first: RoadState,
+) -> Elements:
+    """What each frame makes of the state x before it, one row a frame.
+
+    (A, b, C): its posterior is `A x + b` with covariance C; (eta, J): what it says of x, in information form. The first
+    frame's is the posterior itself, from what was predicted for it.
+    """
+    P = torch.cat((first.covariance, Q[1:]))
+    HP = H @ P
+    SH = torch.linalg.solve(HP @ H.mT + torch.diag_embed(variance), torch.cat((HP, H), dim=-1))
+    K, SH = SH[..., :STATE_SIZE].mT, SH[..., STATE_SIZE:]
+    F = torch.cat((torch.zeros_like(F[:1]), F[1:]))
+    before = torch.cat((first.mean, torch.zeros_like(first.mean).expand(len(F) - 1, -1)))
+    innovation = value[..., None] - H @ before[..., None]
+    left = torch.eye(STATE_SIZE, dtype=F.dtype, device=F.device) - K @ H
+    return (
+        left @ F,
+        before + (K @ innovation)[..., 0],
+        _symmetric(left @ P),
+        (F.mT @ SH.mT @ value[..., None])[..., 0],
+        _symmetric(F.mT @ H.mT @ SH @ F),
+    )
+
+
+def _one_after_another(earlier: Elements, later: Elements) -> Elements:
+    """Two stretches of frames as one (Sarkka and Garcia-Fernandez 2021, Lemma 8)."""
+    A, b, C, eta, J = earlier
+    A_on, b_on, C_on, eta_on, J_on = later
+    eye = torch.eye(STATE_SIZE, dtype=A.dtype, device=A.device)
+    shifted = b + (C @ eta_on[..., None])[..., 0]
+    forward = A_on @ torch.linalg.solve(eye + C @ J_on, torch.cat((A, shifted[..., None], C), -1))
+    left = eta_on - (J_on @ b[..., None])[..., 0]
+    back = A.mT @ torch.linalg.solve(eye + J_on @ C, torch.cat((left[..., None], J_on @ A), -1))
+    return (
+        forward[..., :STATE_SIZE],
+        forward[..., STATE_SIZE] + b_on,
+        _symmetric(forward[..., STATE_SIZE + 1 :] @ A_on.mT) + C_on,
+        back[..., 0] + eta,
+        _symmetric(back[..., 1:]) + J,
+    )
+
+
+def _one_before_another(later: Elements, earlier: Elements) -> Elements:
+    """Two stretches of a smoother's maps `x = G x_next + shift`, with what they leave unsure, as one."""
+    G, shift, spread = earlier
+    G_on, shift_on, spread_on = later
+    return G @ G_on, (G @ shift_on[..., None])[..., 0] + shift, G @ spread_on @ G.mT + spread
+
+
+def _inflation(m: Measurements, predicted: RoadState, config: KalmanConfig) -> Float[Tensor, "f s"]:
+    """By how much the variance of each measurement counts for more, as it is further off than the gate."""
+    innovation = m.value - ((m.row + m.known) @ predicted.mean[..., None])[..., 0]
+    S = ((m.row @ predicted.covariance) * m.row).sum(-1) + m.variance
+    return (innovation.abs() / (config.gate * S.sqrt())).clamp_min(1).square()
+
+
+def _symmetric(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
+    return 0.5 * (matrix + matrix.mT)
 
 
 def _transitions(m: Measurements) -> Float[Tensor, "f 6 6"]:

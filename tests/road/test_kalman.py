@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 from crowdmap_torch.noise.positioning import PositioningNoise
@@ -92,6 +95,46 @@ def test_frames_can_come_one_at_a_time(generator: torch.Generator) -> None:
         result = filter_forward(state, part, NOISE, config).state
         torch.testing.assert_close(result.mean[0], whole[k])
         state = type(state)(result.mean[0], result.covariance[0])
+
+
+def in_a_loop(m: Measurements, config: KalmanConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """Means and covariances of all frames, one after another as in the textbook."""
+    start = first_state(config, m.value)
+    F, Q = _transitions(m), _process_noise(m, NOISE, config)
+    x, P = start.mean, start.covariance
+    means, covariances = [], []
+    for k in range(len(m)):
+        x, P = F[k] @ x, F[k] @ P @ F[k].T + Q[k]
+        H = m.row[k]
+        innovation = m.value[k] - (H + m.known[k]) @ x
+        S = H @ P @ H.T
+        R = m.variance[k]
+        excess = innovation.abs() / (config.gate * (S.diagonal() + R).sqrt())
+        S = S + torch.diag(R * excess.clamp_min(1).square())
+        gain = torch.linalg.solve(S, H @ P).T
+        x, P = x + gain @ innovation, P - gain @ H @ P
+        means.append(x)
+        covariances.append(P)
+    return torch.stack(means), torch.stack(covariances)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7, 300])
+def test_states_are_those_of_a_loop_over_frames(frames: int, generator: torch.Generator) -> None:
+    config = KalmanConfig()
+    m = random_measurements(frames, generator)
+    # A tenth are far off, some of them in one frame after another, and some of the state is only known.
+    off = torch.rand(frames, 3, dtype=F64, generator=generator) < 0.1
+    off[frames // 2 : frames // 2 + 20] = True
+    known = torch.zeros_like(m.known)
+    known[:, 2, 5] = 3
+    m = replace(m, value=torch.where(off, 20 * m.value, m.value), known=known)
+    state = filter_forward(first_state(config, m.value), m, NOISE, config).state
+    mean, covariance = in_a_loop(m, config)
+    # Of each state in units of its own sigma; the products of 300 frames lose some digits.
+    sigma = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    torch.testing.assert_close(state.mean / sigma, mean / sigma, rtol=1e-8, atol=1e-8)
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    torch.testing.assert_close(state.covariance / scale, covariance / scale, rtol=1e-8, atol=1e-8)
 
 
 def test_an_outlier_moves_the_state_no_further_than_the_gate(generator: torch.Generator) -> None:
