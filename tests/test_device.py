@@ -21,6 +21,7 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import read_truth
+from crowdmap_torch.optim import band_cholesky
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of
 from crowdmap_torch.tables import Dataset, Rows, to_device
@@ -55,6 +56,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def here(folder: Path) -> Dataset:
     return load_dataset(folder)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_way_to_factor_bands() -> Iterator[None]:
+    """LAPACK, which the CPU has and no other device, rounds otherwise in the last bits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(band_cholesky, "_by_lapack", band_cholesky._by_blocks)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
-from scipy.linalg import solveh_banded
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
@@ -16,6 +15,7 @@ from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_
 from crowdmap_torch.crowd_signs.distance import mahalanobis
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim.band_cholesky import cholesky_banded
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.ranges import Rounds, Settings, Share, Sigma, Spacing
 from crowdmap_torch.tables import Signs
@@ -331,16 +331,14 @@ def _solve_chain(
 ) -> Float[Tensor, "k 3 m"]:
     """Solution of a symmetric block-tridiagonal system; `below[k]` couples k and k + 1 and is symmetric."""
     K = len(diagonal)
-    D, L = diagonal.detach().cpu().numpy(), below.detach().cpu().numpy()
-    band = np.zeros((6, K, 3))
+    lower = diagonal.new_zeros(K, 3, 6)
     for column in range(3):
-        for row in range(3):
-            if row >= column:
-                band[row - column, :, column] = D[:, row, column]
-            band[3 + row - column, :, column] = L[:, row, column]
-    flat = right.detach().cpu().numpy().reshape(3 * K, -1)
-    solved = solveh_banded(band.reshape(6, 3 * K), flat, lower=True)
-    return torch.from_numpy(solved.reshape(right.shape)).to(right)
+        lower[:, column, : 3 - column] = diagonal[:, column:, column]
+        lower[:, column, 3 - column : 6 - column] = below[:, :, column]
+    factor = cholesky_banded(lower.view(3 * K, 6))
+    if factor is None:
+        raise ArithmeticError("a chain of biases without a prior")
+    return factor.solve(right.reshape(3 * K, -1)).reshape(right.shape)
 
 
 def _node_at(

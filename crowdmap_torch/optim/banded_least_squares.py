@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-import torch
 from jaxtyping import Float, Int
-from scipy.linalg import solveh_banded
 from torch import Tensor
+
+from crowdmap_torch.optim.band_cholesky import cholesky_banded
 
 
 def solve_banded(
@@ -22,7 +21,7 @@ def solve_banded(
     mix. Every unknown needs an equation. Columns of `target` are solved for at once.
     """
     width = row.shape[1]
-    band = row.new_zeros(width, count)
+    lower = row.new_zeros(count, width)
     rhs = row.new_zeros(count, target.shape[1])
     weighted = row * weight[:, None]
     for j in range(width):
@@ -30,8 +29,8 @@ def solve_banded(
         at = (start + j).clamp_max(count - 1)
         rhs.index_add_(0, at, weighted[:, j, None] * target)
         for i in range(j, width):
-            band[i - j].index_add_(0, at, weighted[:, j] * row[:, i])
-    solution = solveh_banded(
-        band.detach().cpu().numpy(), rhs.detach().cpu().numpy(), lower=True, check_finite=False
-    )
-    return torch.from_numpy(np.ascontiguousarray(solution)).to(row)
+            lower[:, i - j].index_add_(0, at, weighted[:, j] * row[:, i])
+    factor = cholesky_banded(lower)
+    if factor is None:
+        raise ArithmeticError("an unknown is in no equation")
+    return factor.solve(rhs)

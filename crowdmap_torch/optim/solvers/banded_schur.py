@@ -15,12 +15,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 from torch import Tensor
 
+from crowdmap_torch.optim.band_cholesky import BandFactor, cholesky_banded
 from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, TermRows, add_blocks, assemble
@@ -176,7 +175,7 @@ class BandNormalEquations:
         reduced = self._reduced(own_added, path_added)
         if reduced is None:
             return failed_step(self._unpack(self.own_gradient, self.path_gradient), self.cost)
-        path_step = -reduced.solve(self._reduced_gradient(reduced)[:, None])[:, 0]
+        path_step = -reduced.path.solve(self._reduced_gradient(reduced)[:, None])[:, 0]
         bound = (self.coupling @ path_step[self.columns()][..., None])[..., 0]
         own_step = -(reduced.inverse @ (self.own_gradient + bound)[..., None])[..., 0]
         return solved_step(
@@ -199,7 +198,7 @@ class BandNormalEquations:
             return torch.full_like(self.cost[0], torch.inf)
         right_side = self._reduced_gradient(reduced)
         along = (self.own_gradient[:, None] @ reduced.inverse @ self.own_gradient[..., None]).sum()
-        along = along + right_side @ reduced.solve(right_side[:, None])[:, 0]
+        along = along + right_side @ reduced.path.solve(right_side[:, None])[:, 0]
         return self.cost[0] + (reduced.log_determinant - along) / 2
 
     def _floor(self) -> tuple[Tensor, Tensor]:
@@ -245,7 +244,6 @@ class BandNormalEquations:
         d, width = self.where.path_dim, self.coupling.shape[-1]
         nodes, blocks = self.path.shape[:2]
         band = max(blocks * d, width)
-        # Column by column, the diagonal first: LAPACK's lower band storage, transposed.
         lower = self.path_gradient.new_zeros(nodes * d * band)
         node, back, i, j = (
             torch.arange(k, device=lower.device).reshape(shape)
@@ -261,13 +259,11 @@ class BandNormalEquations:
         start = self.where.first[:, None] * d
         at = (start + column) * band + row - column
         lower.index_add_(0, at.flatten(), -schur[:, row, column].flatten())
-        stored = lower.view(nodes * d, band).cpu().numpy().T
-        try:
-            ab = cholesky_banded(stored, lower=True, overwrite_ab=True, check_finite=False)
-        except LinAlgError:
+        of_path = cholesky_banded(lower.view(nodes * d, band))
+        if of_path is None:
             return None
         own = factor.diagonal(dim1=-2, dim2=-1).log().sum()
-        return _Reduced(inverse, ab, 2 * (own + float(np.log(ab[0]).sum())))
+        return _Reduced(inverse, of_path, 2 * own + of_path.log_determinant)
 
     def _unpack(
         self, own: Float[Tensor, "n k"], path: Float[Tensor, " q"]
@@ -326,7 +322,7 @@ class BandCovariance:
             function.index_put_(
                 (at, number[..., None].expand_as(at)), through[part], accumulate=True
             )
-            solved = reduced.solve(function)
+            solved = reduced.path.solve(function)
             # Of the solution those rows count that the row's own functions read.
             parts.append(through[part] @ solved[at[:, 0, :, None], number[:, None]])
         return torch.cat(parts)
@@ -338,13 +334,10 @@ class _Reduced:
 
     inverse: Float[Tensor, "n k k"]
     """Of each landmark's own part."""
-    factor: Float[np.ndarray, "w q"]
+    path: BandFactor
+    """What is left of the path."""
     log_determinant: Float[Tensor, ""]
     """Of the whole matrix."""
-
-    def solve(self, right: Float[Tensor, "q c"]) -> Float[Tensor, "q c"]:
-        x = cho_solve_banded((self.factor, True), right.cpu().numpy(), check_finite=False)
-        return torch.from_numpy(x).to(right)
 
 
 def _layout(problem: Problem, values: Values, path: str) -> PathLayout:
