@@ -190,7 +190,7 @@ class Standing:
 def standing(bundle: Bundle, state: lm.LmState, steps: int) -> Standing:
     """Where the adjustment stands after `steps` steps; the tensors are the bundle's own, which the next step changes."""
     beside = {k: v for k, v in bundle.state_dict().items() if k not in bundle.unknown_names}
-    return Standing(steps, replace(state, normal=None, proposed=None), beside)
+    return Standing(steps, replace(state, normal=None), beside)
 
 
 @torch.no_grad()

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.benchmark import free_corners
 from crowdmap_torch.benchmark.free_corners import FreeCorners
-from crowdmap_torch.benchmark.kept_matrix import KeptMatrixConfig, minimise
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.optim import levenberg_marquardt as lm
@@ -36,10 +36,8 @@ from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.ranges import Rounds, Workers, argument
 
-MINIMISATION = KeptMatrixConfig(
-    lm.LmConfig(max_iterations=100, cost_tolerance=1e-6, initial_damping=1e-8, max_stretch=3.0)
-)
-"""Both stages stop when a step lowers the cost by less than a millionth, as the peers do."""
+MINIMISATION = replace(AdjustConfig().lm, max_iterations=100, cost_tolerance=1e-6)
+"""The mapper's own, but that both stages stop when a step lowers the cost by less than a millionth, as the peers do."""
 PEERS = {"ceres": "peers/ceres.py", "gtsam": "peers/gtsam.py"}
 SERIES = ((5, 100, 10), (5, 500, 31), (25, 500, 31), (100, 500, 31), (400, 500, 31), (25, 500, 200))
 """Journeys, frames of each and signs of the problems of the table."""
@@ -134,10 +132,10 @@ def _minimise(
     problem: FreeCorners, built: Problem, values: Values, backend: ChainBackend
 ) -> tuple[lm.LmState, lm.LmState]:
     """The states at the end of both stages."""
-    first = minimise(built, values, MINIMISATION, backend)
+    first = lm.solve(built, values, MINIMISATION, backend=backend)
     corner = replace(built.terms["corner"], loss=Tukey(problem.tukey_c))
     built = replace(built, terms={**built.terms, "corner": corner})
-    return first, minimise(built, first.values, MINIMISATION, backend)
+    return first, lm.solve(built, first.values, MINIMISATION, backend=backend)
 
 
 def _synchronise(device: torch.device) -> None:

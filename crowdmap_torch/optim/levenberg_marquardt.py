@@ -17,7 +17,7 @@ from torch import Tensor
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
 from crowdmap_torch.optim.solvers.dense import DenseBackend
-from crowdmap_torch.optim.solvers.normal_equations import Backend, NormalEquations, Tangents
+from crowdmap_torch.optim.solvers.normal_equations import Backend, NormalEquations
 from crowdmap_torch.ranges import Damping, Factor, RoundsOrNone, Settings, Share
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
@@ -75,8 +75,6 @@ class LmState:
     """Index into `REASONS`."""
     normal: NormalEquations | None = field(default=None, repr=False)
     """Normal equations at the values; None where they moved since, or the problem changed."""
-    proposed: Tangents | None = field(default=None, repr=False)
-    """The last step as the normal equations gave it, before it was stretched or rejected."""
     iterations: int = 0
     linearizations: int = 0
 
@@ -166,7 +164,6 @@ def step(
         reason=reason,
         # After a rejected step the linearisation still holds.
         normal=None if moved else normal,
-        proposed=proposal.delta,
         iterations=state.iterations + 1,
     )
 

@@ -83,18 +83,12 @@ def linearize(term: CostTerm, variables: Mapping[str, Variable], values: Values)
 
 
 @dataclass(frozen=True)
-class RowGradients:
-    """Every row's loss and gradient, by slot, with the rows as the last axis."""
+class RowBlocks:
+    """Every row's loss and its part of the normal equations, by slot, with the rows as the last axis."""
 
     rho: Float[Tensor, " m"]
     gradient: tuple[Float[Tensor, "_ m"], ...]
     """`J_i^T W r` of every slot i."""
-
-
-@dataclass(frozen=True)
-class RowBlocks(RowGradients):
-    """Every row's part of the normal equations."""
-
     hessian: Mapping[tuple[int, int], Float[Tensor, "_ _ m"]]
     """`J_i^T W J_j` of every two slots i <= j."""
 
@@ -114,14 +108,6 @@ def row_blocks(term: CostTerm, variables: Mapping[str, Variable], values: Values
                 block = _product(pulling, other)
             hessian[i, j] = block
     return RowBlocks(rho, _pulled(jacobians, residual * weight), hessian)
-
-
-def row_gradients(
-    term: CostTerm, variables: Mapping[str, Variable], values: Values
-) -> RowGradients:
-    """Every row's gradient alone."""
-    residual, jacobians, weight, rho = _weighted(term, variables, values)
-    return RowGradients(rho, _pulled(jacobians, residual * weight))
 
 
 def dense(jacobians: tuple[Jacobian, ...]) -> tuple[Float[Tensor, "d _ m"], ...]:

@@ -88,12 +88,6 @@ def test_blocks_of_rows_are_products_of_weighted_jacobians(term: CostTerm, value
     assert torch.equal(blocks.rho, found.rho)
 
 
-def test_gradients_alone_are_those_of_the_blocks(term: CostTerm, values: Values):
-    alone = linearize.row_gradients(term, VARIABLES, values)
-    blocks = linearize.row_blocks(term, VARIABLES, values)
-    assert all(map(torch.equal, alone.gradient, blocks.gradient))
-
-
 def structured(
     x: Tensor, y: Tensor
 ) -> tuple[Tensor, tuple[Tensor | SparseJacobian | Follows, ...]]:

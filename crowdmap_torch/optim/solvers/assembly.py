@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, RowGradients, chunks, rows
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, chunks, rows
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
 from crowdmap_torch.processes.threads import in_order
 
-_Blocks = TypeVar("_Blocks", bound=RowGradients)
-_Blocks_co = TypeVar("_Blocks_co", bound=RowGradients, covariant=True)
+_Blocks = TypeVar("_Blocks", bound=RowBlocks)
+_Blocks_co = TypeVar("_Blocks_co", bound=RowBlocks, covariant=True)
 _Linearize = Callable[[CostTerm, dict[str, Variable], Values], _Blocks]
 
 

@@ -34,7 +34,6 @@ from crowdmap_torch.optim.solvers.normal_equations import (
     LinearFunctions,
     Step,
     StepPart,
-    Tangents,
     failed_step,
     solved_step,
 )
@@ -261,16 +260,6 @@ class ChainNormalEquations:
             own = lead.whiten.mT @ (lead.whiten @ rest[batch.place])
             solution[batch.place] = own + lead.towards @ beside
         return solution[structure.place]
-
-    def solve_again(self, gradient: Tangents) -> dict[str, Tensor]:
-        """The step for another gradient by the last factors, whatever the damping they were made with."""
-        a = torch.cat([gradient[name] for name in self.structure.plan.first_block])[..., None]
-        x = self.solve_eliminated(a)
-        one = torch.zeros_like(self.structure.owner)
-        b = self.structure.where.pack(gradient)[0]
-        y = self.solve_reduced(self.couple(x, one, 1)[..., 0] - b[:, None])[:, 0]
-        x = x + self.solve_eliminated(self.couple_back(y)[..., None])
-        return self.unpack(-x[..., 0], y)
 
     def couple(
         self, x: Float[Tensor, "e k c"], column: Int[Tensor, " e"], columns: int

@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from worlds.bordered_chains import drives
 
-from crowdmap_torch.optim.linearize import row_blocks, row_gradients, term_costs
+from crowdmap_torch.optim.linearize import row_blocks, term_costs
 from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, assemble
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 
 def test_costs_are_those_of_the_terms():
     problem, values, _ = drives()
-    costs = assemble(problem, values, row_gradients, lambda _: None, chunk_rows=7)
+    costs = assemble(problem, values, row_blocks, lambda _: None, chunk_rows=7)
     for name, cost in term_costs(problem, values).items():
         torch.testing.assert_close(costs.by_term[name], cost)
     torch.testing.assert_close(costs.total, sum(costs.by_term.values()))

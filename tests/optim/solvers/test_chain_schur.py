@@ -243,21 +243,6 @@ def test_a_chain_that_is_not_positive_definite_gives_a_failed_step_and_no_covari
         spoilt_normal.covariance()
 
 
-def test_kept_factors_give_the_step_of_another_gradient():
-    built, values, chain = problem([30, 20], seed=5)
-    damping = torch.tensor([0.0], dtype=torch.float64)
-    normal = ChainBackend(EliminationPlan("pose", chain)).assemble(built, values)
-    normal.solve(damping)
-    gradient = {name: torch.randn_like(value) for name, value in values.items()}
-    step = normal.solve_again(gradient)
-    dense = DenseBackend().assemble(built, values)
-    stacked = torch.cat((gradient["pose"].flatten(), gradient["mark"].flatten()))
-    expected = -torch.linalg.solve(dense.hessian[0], stacked)
-    n = 3 * len(chain)
-    torch.testing.assert_close(step["pose"].flatten(), expected[:n], rtol=1e-7, atol=1e-9)
-    torch.testing.assert_close(step["mark"].flatten(), expected[n:], rtol=1e-7, atol=1e-9)
-
-
 def test_a_rank_that_is_given_changes_the_order_alone():
     built, values, chain = problem([10, 1, 9, 8])
     plan = EliminationPlan("pose", chain)
