@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
@@ -58,6 +60,52 @@ def drives(lengths=(30, 1, 17), marks=7, seed=0):
     values = {name: noise(count, 2) for name, count in names.items()}
     plan = EliminationPlan("drift", chain, "pose", carrier, "bias")
     return Problem(variables, terms), values, plan
+
+
+def shared_drives(lengths=(30, 1, 17), marks=7, seed=0):
+    """The same by cars with errors of their own, of three numbers: in every pose, in every sighting, and beside the bias.
+
+    Chains take turns with two cars; a third has no chain.
+    """
+    problem, values, plan = drives(lengths, marks, seed)
+    car = torch.arange(len(lengths) + 1) % 2
+    of_drift, of_pose = car[plan.chain], car[plan.chain][plan.carrier]
+    sighting = problem.terms["sighting"]
+    pose = sighting.slots[0][1]
+    every = torch.arange(3)
+
+    def bound(x, d, c):
+        return x - d - c[:2]
+
+    def seen(x, m, c, measured):
+        return (m - x) * (1 + 0.1 * c[2]) + 0.3 * c[1:] - measured
+
+    def beside(d, b, c):
+        return d - b + c[:2] * c[2]
+
+    first = problem.terms["start"].slots[0][1]
+    terms = {
+        **problem.terms,
+        "bound": replace(
+            problem.terms["bound"],
+            residual=bound,
+            slots=(*problem.terms["bound"].slots, ("car", of_pose)),
+        ),
+        "sighting": CostTerm(
+            seen, (("pose", pose), sighting.slots[1], ("car", of_pose[pose])), sighting.constants
+        ),
+        "start": CostTerm(beside, (*problem.terms["start"].slots, ("car", of_drift[first]))),
+        "car": CostTerm(lambda c: c - 0.3, (("car", every),)),
+        "mark of a car": CostTerm(
+            lambda c, m: c[:2] - m,
+            (("car", every), ("mark", every)),
+            weight=torch.full((3,), 0.2).double(),
+        ),
+    }
+    generator = torch.Generator().manual_seed(seed + 1)
+    variables = {**problem.variables, "car": Variable(3, euclidean)}
+    values = {**values, "car": torch.randn(3, 3, dtype=torch.float64, generator=generator)}
+    return Problem(variables, terms), values, replace(plan, shared={"car": car})
 
 
 def rows_of(dense, name):

@@ -20,29 +20,31 @@ class ChainSums:
     def __init__(self, structure: ChainStructure, problem: Problem, values: Values) -> None:
         plan = structure.plan
         like, k = values[plan.chains], problem.variables[plan.chains].tangent_dim
-        b = 0 if plan.border is None else problem.variables[plan.border].tangent_dim
         self.structure = structure
         self.by_variable = BlockDiagonal(problem, values)
         self.link = like.new_zeros(len(structure.owner), k, k)
         """Block of A of each chain's block with its successor, of each leaf with the block that carries it."""
-        self.border = like.new_zeros(len(structure.owner), k, b)
-        """Block of each with its chain's block of the border."""
+        self.border = {
+            name: like.new_zeros(len(structure.owner), k, problem.variables[name].tangent_dim)
+            for name in plan.border_names
+        }
+        """Block of each with its chain's block of every variable of the border."""
 
     def add(self, chunk: TermRows[RowBlocks]) -> None:
         """Adds a chunk of rows."""
         self.by_variable.add(chunk)
-        plan, first = self.structure.plan, self.structure.plan.first_block
+        first = self.structure.plan.first_block
         for i, j in pairs(len(chunk.slots)):
             (name, block), (other, block_of_other) = chunk.slots[i], chunk.slots[j]
             if name in first and other in first:
                 here, there = block + first[name], block_of_other + first[other]
                 self._add_link(here, there, chunk.blocks.hessian[i, j].permute(2, 0, 1))
-            elif name in first and other == plan.border:
+            elif name in first and other in self.border:
                 beside = chunk.blocks.hessian[i, j].permute(2, 0, 1)
-                self.border.index_add_(0, block + first[name], beside)
-            elif name == plan.border and other in first:
+                self.border[other].index_add_(0, block + first[name], beside)
+            elif name in self.border and other in first:
                 beside = chunk.blocks.hessian[i, j].permute(2, 1, 0)
-                self.border.index_add_(0, block_of_other + first[other], beside)
+                self.border[name].index_add_(0, block_of_other + first[other], beside)
 
     def diagonal(self) -> Float[Tensor, "e k k"]:
         """Diagonal blocks of A, counted over leaves and chains."""
@@ -82,9 +84,13 @@ class ReducibleSums(ChainSums):
     ) -> None:
         """`coupling` is memory for B, by term; what is in it is of no account."""
         super().__init__(structure, problem, values)
-        dim = structure.where.dim
+        dim, like = structure.where.dim, values[structure.plan.chains]
         self.coupling = coupling
-        self._matrix = values[structure.plan.chains].new_zeros(dim, dim)
+        self._matrix = like.new_zeros(dim, dim)
+        shared = structure.border.dim if structure.plan.shared else 0
+        self.beside = like.new_zeros(dim, shared)
+        """Blocks between landmarks and the border, where the border is shared; else nothing."""
+        self._among = like.new_zeros(structure.border.dim, structure.border.dim)
         for name, blocks in coupling.items():
             if structure.couplings[name].factor_of_row is not None:
                 blocks.zero_()
@@ -92,17 +98,28 @@ class ReducibleSums(ChainSums):
     def add(self, chunk: TermRows[RowBlocks]) -> None:
         """Adds a chunk of rows."""
         super().add(chunk)
-        where = self.structure.where
+        where, border = self.structure.where, self.structure.border
         for i, j in pairs(len(chunk.slots)):
             (name, block), (other, block_of_other) = chunk.slots[i], chunk.slots[j]
+            square = chunk.blocks.hessian[i, j]
             if name in where.offset and other in where.offset:
                 row, column = where.offset[name][block], where.offset[other][block_of_other]
-                square = chunk.blocks.hessian[i, j]
                 add_blocks(self._matrix.view(-1), row, column, where.dim, square)
                 add_blocks(self._matrix.view(-1), column, row, where.dim, square.transpose(0, 1))
+            elif name in where.offset and other in border.offset:
+                row, column = where.offset[name][block], border.offset[other][block_of_other]
+                add_blocks(self.beside.view(-1), row, column, border.dim, square)
+            elif name in border.offset and other in where.offset:
+                row, column = where.offset[other][block_of_other], border.offset[name][block]
+                square = square.transpose(0, 1)
+                add_blocks(self.beside.view(-1), row, column, border.dim, square)
+            elif name in border.offset and other in border.offset:
+                row, column = border.offset[name][block], border.offset[other][block_of_other]
+                add_blocks(self._among.view(-1), row, column, border.dim, square)
+                add_blocks(self._among.view(-1), column, row, border.dim, square.transpose(0, 1))
         if chunk.term in self.coupling:
             coupling = self.structure.couplings[chunk.term]
-            _add_coupling(self.coupling[chunk.term], coupling, chunk)
+            _add_coupling(self.coupling[chunk.term], coupling, chunk, set(border.offset))
 
     def landmark_hessian(self) -> Float[Tensor, "r r"]:
         """The matrix C."""
@@ -112,6 +129,19 @@ class ReducibleSums(ChainSums):
             add_blocks(self._matrix.view(-1), offset, offset, where.dim, square)
         return self._matrix
 
+    def border_hessian(self) -> Float[Tensor, "z z"]:
+        """The matrix of the border, its variables behind each other."""
+        border = self.structure.border
+        for name, offset in border.offset.items():
+            square = self.by_variable.hessian(name).permute(1, 2, 0)
+            add_blocks(self._among.view(-1), offset, offset, border.dim, square)
+        return self._among
+
+    def border_gradient(self) -> Float[Tensor, " z"]:
+        """The gradient by the border."""
+        border = self.structure.border
+        return border.pack({n: self.by_variable.gradient(n) for n in border.offset})[0]
+
     def landmark_gradient(self) -> Float[Tensor, " r"]:
         """The gradient b."""
         names = (*self.structure.plan.first_block, *self.structure.where.offset)
@@ -119,12 +149,12 @@ class ReducibleSums(ChainSums):
 
 
 def _add_coupling(
-    total: Float[Tensor, "f w k"], coupling: Coupling, chunk: TermRows[RowBlocks]
+    total: Float[Tensor, "f w k"], coupling: Coupling, chunk: TermRows[RowBlocks], border: set[str]
 ) -> None:
-    """Adds the blocks between the rows' eliminated slot and the others, in place."""
+    """Adds the blocks between the rows' eliminated slot and those of landmarks, in place."""
     slot, start = coupling.slot, 0
     for other in range(len(chunk.slots)):
-        if other == slot:
+        if other == slot or chunk.slots[other][0] in border:
             continue
         block = chunk.blocks.hessian[min(slot, other), max(slot, other)]
         block = block.permute(2, 1, 0) if slot < other else block.permute(2, 0, 1)

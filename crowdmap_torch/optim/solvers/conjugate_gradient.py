@@ -80,7 +80,7 @@ class ConjugateGradientBackend:
             rows=kept,
             gradient={name: sums.by_variable.gradient(name) for name in names},
             square={name: sums.by_variable.hessian(name) for name in names},
-            border=sums.border,
+            border=sums.border.get(self.plan.border or "", sums.link[..., :0]),
         )
 
     def _analysed(self, problem: Problem, values: Values) -> ChainStructure:
@@ -345,6 +345,11 @@ class SampledCovariance:
         """What all rows have in common: too few samples to tell to the last, the mean over all pairs is next to it."""
         value = self._values(functions).mean(0)
         return value @ value.mT / value.shape[-1]
+
+    def of_border(self, name: str) -> Float[Tensor, "n b b"]:
+        """Covariance of every block of a variable of the border."""
+        drawn = self.drawn[name]
+        return drawn @ drawn.mT / drawn.shape[-1]
 
     def of_chain_sums(self, weight: Float[Tensor, "n k m"]) -> Float[Tensor, "j m m"]:
         """Covariance of `m` weighted sums over the blocks of each chain."""

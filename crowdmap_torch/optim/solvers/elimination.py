@@ -17,8 +17,8 @@ that is kept, `windows` says.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -74,6 +74,8 @@ class ChainStructure:
     """Of blocks that do not touch each other, eliminated at once."""
     owner: Int[Tensor, " e"]
     """Chain that each block belongs to, counted over leaves and chains."""
+    border: Layout
+    """The border's variables, one behind the other."""
 
     @property
     def batches(self) -> list[Batch]:
@@ -109,7 +111,8 @@ def analyse(
     """The elimination of a plan's leaves and chains in a problem.
 
     Every row may touch one eliminated block and any landmarks; or one or two eliminated blocks, neighbours of a chain or a
-    leaf and the block that carries it, and beside them the chain's own block of the border.
+    leaf and the block that carries it. Beside them it may touch the chain's own block of the border, unless it touches
+    landmarks, and the blocks that its chain shares.
     """
     where, landmarks, couplings, keys = _touched(problem, values, plan)
     owner = plan.owner
@@ -140,6 +143,7 @@ def analyse(
         right_side_row=builder.first_row[:-1],
         store_rows=builder.store_rows,
         owner=owner,
+        border=layout(problem, values, skip=_all_but(problem, plan.border_names)),
     )
 
 
@@ -157,14 +161,14 @@ def _touched(
     problem: Problem, values: Values, plan: EliminationPlan
 ) -> tuple[Layout, LandmarkBlocks, dict[str, Coupling], Int[Tensor, " keys"]]:
     """The reduced system, its blocks, and what of it the eliminated blocks are coupled to, by term and as keys."""
-    where = layout(problem, values, skip=(*plan.first_block, *_named(plan.border)))
+    where = layout(problem, values, skip=(*plan.first_block, *plan.border_names))
     landmarks = LandmarkBlocks.of(where, plan.chain.device)
     couplings = _couplings(problem.terms, plan, plan.owner, landmarks)
     return where, landmarks, couplings, _coupled_landmarks(couplings, landmarks)
 
 
-def _named(name: str | None) -> tuple[str, ...]:
-    return () if name is None else (name,)
+def _all_but(problem: Problem, names: Collection[str]) -> tuple[str, ...]:
+    return tuple(name for name in problem.variables if name not in names)
 
 
 def _couplings(
@@ -174,26 +178,32 @@ def _couplings(
     first_block, couplings = plan.first_block, {}
     for name, term in terms.items():
         eliminated = [i for i, (slot, _) in enumerate(term.slots) if slot in first_block]
-        border = [i for i, (slot, _) in enumerate(term.slots) if slot == plan.border]
+        border = [i for i, (slot, _) in enumerate(term.slots) if slot in plan.border_names]
+        own = [i for i in border if term.slots[i][0] == plan.border]
         others = len(term.slots) - len(eliminated) - len(border)
         if len(eliminated) > 2 or (others and len(eliminated) > 1):
             raise ValueError(
                 f"term {name!r} couples {len(eliminated)} eliminated blocks and {others} others; "
                 "at most two eliminated blocks are supported, and one with landmarks"
             )
-        if (others and border) or len(border) > 1:
+        if (others and own) or len(own) > 1:
             raise ValueError(
                 f"term {name!r} couples a block of the border {plan.border!r} with landmarks or "
                 "another one; only its own chain's blocks are supported"
             )
-        for i in eliminated if border else ():
+        for i in eliminated:
             slot, block = term.slots[i]
-            if not torch.equal(owner[block + first_block[slot]], term.slots[border[0]][1]):
-                raise ValueError(
-                    f"term {name!r} couples blocks of {slot!r} with the border of another chain"
-                )
+            chain = owner[block + first_block[slot]]
+            for beside, its_block in (term.slots[k] for k in border):
+                if not torch.equal(plan.border_block(beside, chain), its_block):
+                    raise ValueError(
+                        f"term {name!r} couples blocks of {slot!r} with the {beside!r} of another chain"
+                    )
         if others and eliminated:
-            couplings[name] = _coupling(term, eliminated[0], landmarks, first_block)
+            at = [i for i in range(len(term.slots)) if i not in border]
+            term = replace(term, slots=tuple(term.slots[i] for i in at))
+            found = _coupling(term, at.index(eliminated[0]), landmarks, first_block)
+            couplings[name] = replace(found, slot=eliminated[0])
     return couplings
 
 

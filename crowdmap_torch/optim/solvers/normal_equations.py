@@ -115,6 +115,10 @@ class MapCovariance(Covariance, Protocol):
         """
         ...
 
+    def of_border(self, name: str) -> Float[Tensor, "n b b"]:
+        """Covariance of every block of a variable that drives have to themselves or share."""
+        ...
+
     def of_chain_sums(self, weight: Float[Tensor, "n k m"]) -> Float[Tensor, "j m m"]:
         """Covariance of `m` weighted sums over each chain's own blocks."""
         ...

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Int
@@ -14,7 +15,8 @@ class EliminationPlan:
     """Leaves go first, then the chains they hang on; what is not named are landmarks, solved for together; the border last.
 
     A frame's pose is a leaf on the drift of its journey, the drift of a journey is a chain, and the journey's bias its
-    block of the border. Chains do not touch each other but through landmarks.
+    block of the border, as is the calibration of the car that it shares with others. Chains touch each other through
+    landmarks and through what they share, and through nothing else.
     """
 
     chains: str
@@ -27,6 +29,8 @@ class EliminationPlan:
     """Block of the chains that each leaf hangs on."""
     border: str | None = None
     """Variable of which each chain has a block of its own, that of its number; None: there is none."""
+    shared: Mapping[str, Int[Tensor, " j"]] = field(default_factory=dict)
+    """Variables of the border that several chains have one block of in common, by name: the block of each chain."""
     rank: Float[Tensor, " q"] | None = None
     """A position of every landmark on a line (`landmark_rank`); None: found whenever rows touch other landmarks."""
 
@@ -49,6 +53,15 @@ class EliminationPlan:
     def chain_count(self) -> int:
         """Number of chains that have a block."""
         return len(torch.unique(self.chain))
+
+    @property
+    def border_names(self) -> tuple[str, ...]:
+        """The border's variables."""
+        return (*(() if self.border is None else (self.border,)), *self.shared)
+
+    def border_block(self, name: str, chain: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
+        """The block of a variable of the border that chains have."""
+        return self.shared[name][chain] if name in self.shared else chain
 
     @property
     def leaf_count(self) -> int:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import pytest
 import torch
-from worlds.bordered_chains import drives, rows_of
+from worlds.bordered_chains import drives, rows_of, shared_drives
 
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 
+@pytest.mark.parametrize("world", [drives, shared_drives])
 @pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
-def test_a_border_gives_the_dense_step(lengths):
-    problem, values, plan = drives(lengths)
+def test_a_border_gives_the_dense_step(lengths, world):
+    problem, values, plan = world(lengths)
     ours, dense = (b.assemble(problem, values) for b in (BorderedBackend(plan), DenseBackend()))
     torch.testing.assert_close(ours.cost, dense.cost)
     for name, cost in dense.term_cost.items():
@@ -27,8 +28,9 @@ def test_a_border_gives_the_dense_step(lengths):
         torch.testing.assert_close(mine.norm, theirs.norm)
 
 
-def test_covariances_are_blocks_of_the_dense_inverse():
-    problem, values, plan = drives()
+@pytest.mark.parametrize("world", [drives, shared_drives])
+def test_covariances_are_blocks_of_the_dense_inverse(world):
+    problem, values, plan = world()
     dense = DenseBackend().assemble(problem, values)
     inverse, chain = torch.linalg.inv(dense.hessian[0]), plan.chain
     # Sums over each chain: of the first entry by mean, of the second by differing weights.
@@ -46,6 +48,10 @@ def test_covariances_are_blocks_of_the_dense_inverse():
     every = torch.arange(4)
     expected = joint[every, :, every]
     torch.testing.assert_close(found.of_chain_sums(weight), expected, rtol=1e-8, atol=1e-12)
+    for name in plan.border_names:
+        at = rows_of(dense, name).view(len(values[name]), -1)
+        expected = inverse[at[:, :, None], at[:, None]]
+        torch.testing.assert_close(found.of_border(name), expected, rtol=1e-8, atol=1e-12)
 
 
 def test_a_covariance_whose_factors_are_gone_is_refused():
@@ -57,8 +63,9 @@ def test_a_covariance_whose_factors_are_gone_is_refused():
         covariance.of_chain_sums(torch.zeros(len(plan.chain), 2, 1, dtype=torch.float64))
 
 
-def test_the_minimum_is_that_of_the_dense_back_end():
-    problem, values, plan = drives(seed=1)
+@pytest.mark.parametrize("world", [drives, shared_drives])
+def test_the_minimum_is_that_of_the_dense_back_end(world):
+    problem, values, plan = world(seed=1)
     config = lm.LmConfig(cost_tolerance=1e-13)
     ours = lm.solve(problem, values, config, backend=BorderedBackend(plan))
     theirs = lm.solve(problem, values, config)

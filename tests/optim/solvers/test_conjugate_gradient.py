@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from worlds.bordered_chains import drives, rows_of
+from worlds.bordered_chains import drives, rows_of, shared_drives
 
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
@@ -19,9 +19,10 @@ def conjugate_gradients(plan: EliminationPlan, **changes) -> ConjugateGradientBa
     return ConjugateGradientBackend(plan, **settings)
 
 
+@pytest.mark.parametrize("world", [drives, shared_drives])
 @pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
-def test_conjugate_gradients_give_the_dense_step(lengths):
-    problem, values, plan = drives(lengths)
+def test_conjugate_gradients_give_the_dense_step(lengths, world):
+    problem, values, plan = world(lengths)
     ours, dense = (b.assemble(problem, values) for b in (conjugate_gradients(plan), DenseBackend()))
     torch.testing.assert_close(ours.cost, dense.cost)
     for damping in (1e-9, 1e-2, 1e2):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from worlds.bordered_chains import drives, rows_of
+from worlds.bordered_chains import drives, rows_of, shared_drives
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
@@ -62,7 +62,16 @@ def test_a_border_of_another_chain_is_refused():
     term = problem.terms["start"]
     (drift, block), (bias, at) = term.slots
     terms = {**problem.terms, "start": replace(term, slots=((drift, block), (bias, at.flip(0))))}
-    with pytest.raises(ValueError, match="border of another chain"):
+    with pytest.raises(ValueError, match="'bias' of another chain"):
+        BorderedBackend(plan).assemble(replace(problem, terms=terms), values)
+
+
+def test_what_another_chain_shares_is_refused():
+    problem, values, plan = shared_drives()
+    pose, drift, (car, at) = problem.terms["bound"].slots
+    wrong = replace(problem.terms["bound"], slots=(pose, drift, (car, 1 - at)))
+    terms = {**problem.terms, "bound": wrong}
+    with pytest.raises(ValueError, match="'car' of another chain"):
         BorderedBackend(plan).assemble(replace(problem, terms=terms), values)
 
 
