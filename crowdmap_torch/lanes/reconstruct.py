@@ -16,6 +16,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, group_mode, group_range, group_sum
 from crowdmap_torch.geometry import spline_basis, spline_length
+from crowdmap_torch.lanes.existence import expected_by_chance
 from crowdmap_torch.lanes.pieces import (
     LaneFit,
     LanePieces,
@@ -44,9 +45,16 @@ from crowdmap_torch.road.ground_projection import (
 from crowdmap_torch.tables import ControlPoints, Journey, Lanes, RoadEstimate, Tracklets
 
 METHODS = ("surface", "paper2017")
-REASONS = ("kept", "too few frames", "no points near enough", "too short", "too uncertain")
+REASONS = (
+    "kept",
+    "too few frames",
+    "no points near enough",
+    "too short",
+    "too uncertain",
+    "no better than chance",
+)
 """What becomes of a tracklet, by code."""
-KEPT, FEW_FRAMES, NO_POINTS, SHORT, UNCERTAIN = range(len(REASONS))
+KEPT, FEW_FRAMES, NO_POINTS, SHORT, UNCERTAIN, CHANCE = range(len(REASONS))
 
 
 @dataclass(frozen=True)
@@ -88,6 +96,12 @@ class LaneConfig(Settings):
     """Pieces with fewer points are pruned."""
     max_sigma_m: Sigma = 1.0
     """Pieces whose control points are less sure, in the mean, are pruned."""
+    band_m: Length = 1.2
+    """Detections that run along a piece so near to it say whether it exists (`lanes.existence`): ..."""
+    near_m: Length = 0.25
+    """... those of a marker are this near to it in the mean, those of chance anywhere in the band."""
+    by_chance: Factor = 1.0
+    """Pieces are pruned of which chance would make as many in a drive."""
     range_m: Span = (2.0, 25.0)
     """Depth of the points that are used."""
     piece_m: Spacing = 40.0
@@ -115,6 +129,10 @@ class LaneConfig(Settings):
         super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, found {self.method!r}")
+        if not self.near_m < self.band_m:
+            raise ValueError(
+                f"near_m: expected less than band_m ({self.band_m:g} m), found {self.near_m:g}"
+            )
 
 
 @dataclass(frozen=True)
@@ -151,8 +169,10 @@ def reconstruct_lanes(
     ground = (project_to_planes if is_paper else project_to_surface)(journey, road)
     near, far = config.paper.range_m if is_paper else config.range_m
     detection = journey.lane_points.detection
-    used = is_long[label[detection]] & ground.is_on_ground
-    rows = (used & (ground.depth > near) & (ground.depth < far)).nonzero()[:, 0]
+    used = is_long[label[detection]]
+    in_range = ground.is_on_ground & (ground.depth > near) & (ground.depth < far)
+    everything = ground.point_world[in_range, :2], detection[in_range]
+    rows = (used & in_range).nonzero()[:, 0]
     ground, detection = ground[rows], detection[rows]
     frame, marker = journey.lanes.frame[detection], label[detection]
     if is_paper:
@@ -165,7 +185,10 @@ def reconstruct_lanes(
         reason = reason.index_fill(0, pieces.marker, KEPT)
         kept = torch.ones_like(pieces.marker, dtype=torch.bool)
     else:
-        reason, kept = _judged(pieces, fit, sigma, reason, config)
+        chance = expected_by_chance(
+            fit.control, pieces.control_count, *everything, band=config.band_m, near=config.near_m
+        )
+        reason, kept = _judged(pieces, fit, sigma, chance, reason, config)
     lanes = _table(journey, detection, pieces, fit, sigma, config)
     miss = fit.miss[kept[pieces.piece] & (fit.weight > 0.1)]
     points = int(kept[pieces.piece].sum())
@@ -250,6 +273,7 @@ def _judged(
     pieces: LanePieces,
     fit: LaneFit,
     sigma: Float[Tensor, " c"],
+    chance: Float[Tensor, " n"],
     reason: Int[Tensor, " count"],
     config: LaneConfig,
 ) -> tuple[Int[Tensor, " count"], Bool[Tensor, " n"]]:
@@ -259,10 +283,13 @@ def _judged(
     is_sure = (
         group_sum(sigma, spline_basis.rows(count)[0], len(pieces)) / count < config.max_sigma_m
     )
-    kept = is_sure & (length >= config.min_length_m)
+    is_long = length >= config.min_length_m
+    exists = chance < config.by_chance
+    kept = is_sure & is_long & exists
     for code, pieces_so in (
         (UNCERTAIN, ~is_sure),
-        (SHORT, is_sure & (length < config.min_length_m)),
+        (CHANCE, is_sure & ~exists),
+        (SHORT, is_sure & exists & ~is_long),
         (KEPT, kept),
     ):
         reason = reason.index_fill(0, pieces.marker[pieces_so], code)
