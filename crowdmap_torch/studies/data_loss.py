@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from crowdmap_torch.studies import paper
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Panel, Point, line_of, plot_lines
-from crowdmap_torch.studies.fleet import curve, in_turns, our_maps, paper_heads
 from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.maps import curve, in_turns, our_maps, paper_heads
 from crowdmap_torch.studies.numbers import Result, Spread, number, spread, spread_of
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import Task

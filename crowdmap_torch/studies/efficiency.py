@@ -15,9 +15,9 @@ from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, plot_lines
-from crowdmap_torch.studies.fleet import honest_maps
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.linear_map import linear_map
+from crowdmap_torch.studies.maps import honest_maps
 from crowdmap_torch.studies.measure import load_drives
 from crowdmap_torch.studies.numbers import numbers
 from crowdmap_torch.studies.scale import SHORT_TURNS, Scale

@@ -1,109 +1,195 @@
-"""The maps that several studies look at: many drives on one road, by the number of journeys or by what is varied."""
+"""What real fleets get wrong: each error alone, all of them together, with and without calibration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import chain
 
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.simulate.dataset import SimulationConfig
+from crowdmap_torch.simulate.errors import ALL, ERRORS, VEHICLES, with_errors
+from crowdmap_torch.studies.chapter import Cell, Chapter, Table
+from crowdmap_torch.studies.curves import plot_bars
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import Result, results
-from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
-from crowdmap_torch.studies.tasks import MeasureMap
+from crowdmap_torch.studies.maps import OURS, in_short_turns, in_turns, our_maps
+from crowdmap_torch.studies.numbers import Result, numbers, results, spread_of, weighted_mean
+from crowdmap_torch.studies.scale import Scale
+from crowdmap_torch.studies.study import Settings, Study
+from crowdmap_torch.studies.tasks import MeasureMap, Task
 
-OURS = MapperConfig()
-PAPER = MapperConfig(method="paper2017")
+CALIBRATIONS: Mapping[str, MapperConfig] = {"off": OURS}
+"""Configurations that are compared, by what the column `calibration` says of them; `off` is what others are held to."""
+NONE = "none"
+_FACTORS = (1.0, 2.0)
+_RELATIVE = "map.signs.relative.total.mean"
+_HEADS = "heads.signs.relative.total.mean"
+_LATERAL = "map.lanes.lateral_without_shift.mean"
+_NUMBERS = {
+    "relative [m]": _RELATIVE,
+    "absolute [m]": "map.signs.absolute.total.mean",
+    "cluster heads, relative [m]": _HEADS,
+    "lane lateral [m]": _LATERAL,
+    "sign recall": "map.signs.recall",
+    "lane precision": "map.lanes.precision",
+}
+_COLUMNS = (
+    "error",
+    "times",
+    "calibration",
+    *_NUMBERS,
+    "inside 95 % [%]",
+    "mean NEES",
+    "relative / without errors",
+    "lateral / without errors",
+    "seeds",
+)
 
 
-def short_maps(
-    scale: Scale,
-    config: MapperConfig = OURS,
-    change: Callable[[SimulationConfig], SimulationConfig] = lambda drives: drives,
+@dataclass(frozen=True)
+class Variant:
+    """Drives with some of the errors, so many times as large as they are."""
+
+    error: str
+    """A name of `ERRORS`, `fleet` for all or `none`."""
+    factor: float = 1.0
+
+    def spoil(self, drives: SimulationConfig) -> SimulationConfig:
+        """The same drives with the errors."""
+        return with_errors(drives, () if self.error == NONE else (self.error,), self.factor)
+
+
+RIGHT, FLEET = Variant(NONE), Variant(ALL)
+
+
+def variants(scale: Scale) -> tuple[Variant, ...]:
+    """None, each error alone, and all of them."""
+    names = list(ERRORS)[: scale.fleet_errors]
+    alone = (Variant(name, factor) for name in names for factor in _FACTORS[: scale.fleet_factors])
+    return (RIGHT, *alone, *(Variant(ALL, factor) for factor in _FACTORS[: scale.fleet_factors]))
+
+
+def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
+    """A map for each variant, calibration and seed: of a few drives, on a straight road, and of the fleet as a whole."""
+    scale = settings.scale
+    few = (
+        _few_maps(scale, variant, config)
+        for variant in variants(scale)
+        for config in CALIBRATIONS.values()
+    )
+    straight = (
+        _few_maps(scale, variant, config, straight=True)
+        for variant in (RIGHT, FLEET)
+        for config in CALIBRATIONS.values()
+    )
+    whole = (
+        task
+        for variant in (RIGHT, FLEET)
+        for config in CALIBRATIONS.values()
+        for task in _whole_maps(scale, variant, config)
+    )
+    return chain(in_short_turns(4, few), in_short_turns(4, straight), in_turns(scale, whole))
+
+
+def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
+    """What each error does to the map, and what calibration takes back of it."""
+    scale = settings.scale
+    every = {
+        (variant, name): results(_few_maps(scale, variant, config), folder)
+        for variant in variants(scale)
+        for name, config in CALIBRATIONS.items()
+    }
+    pair = [(v, name, config) for v in (RIGHT, FLEET) for name, config in CALIBRATIONS.items()]
+    straight = {
+        (v, name): results(_few_maps(scale, v, config, straight=True), folder)
+        for v, name, config in pair
+    }
+    whole = {(v, name): results(_whole_maps(scale, v, config), folder) for v, name, config in pair}
+    few = f"{scale.fleet_journeys} drives of {scale.fleet_vehicles} vehicles"
+    return Chapter(
+        text=(
+            f"{few} over {scale.fleet_road.length_m:.0f} m, the same drives each time: every error alone as large as real "
+            "ones are and twice as large, then all of them. Means over seeds. Inside: sign centres in their 95 % ellipsoid, "
+            "of all seeds together, beside the mean normalised squared error (3 is right). Without errors: the same drives "
+            "with perfect calibrations and detectors, `calibration: off`.",
+        ),
+        tables=(
+            Table("fleet", _COLUMNS, _rows(every)),
+            Table(
+                "fleet-straight",
+                _COLUMNS,
+                _rows(straight),
+                f"{few} over {scale.straight_road.length_m:.0f} m that are straight",
+            ),
+            Table(
+                "fleet-whole",
+                _COLUMNS,
+                _rows(whole),
+                f"{scale.journeys} drives of {VEHICLES} vehicles over {scale.road.length_m:.0f} m",
+            ),
+        ),
+        plots={"fleet": plot_bars(_bars(every), x="mean relative corner error [m]")},
+    )
+
+
+def _few_maps(
+    scale: Scale, variant: Variant, config: MapperConfig, *, straight: bool = False
 ) -> list[MeasureMap]:
-    """Maps of the short road, seed by seed, of drives that `change` may worsen."""
-    return [
-        MeasureMap(change(scale.short_drives(seed)), scale.short_journeys, config=config)
-        for seed in range(scale.short_seeds)
-    ]
-
-
-def honest_maps(scale: Scale, sets: int) -> list[MeasureMap]:
-    """Maps of more journeys on the short road, data set by data set: for what is said of their covariances."""
+    """Maps of a few drives, seed by seed."""
     return [
         MeasureMap(
-            replace(scale.short_drives(seed), journeys=scale.honest_journeys), scale.honest_journeys
+            variant.spoil(scale.fleet_drives(seed, straight=straight)),
+            scale.fleet_journeys,
+            config=config,
         )
-        for seed in range(sets)
+        for seed in range(scale.fleet_seeds)
     ]
 
 
-def our_maps(scale: Scale, count: int) -> list[MeasureMap]:
-    """Ours of `count` journeys, seed by seed, a few other journeys each time where they are few."""
-    if count == scale.journeys:
-        seeds = scale.seeds
-    else:
-        seeds = scale.curve_seeds if count < scale.journeys else scale.most_seeds
-    draws = min(scale.draws if count <= 2 else 1, scale.journeys // count or 1)
-    apart = scale.journeys // draws
-    return [
-        MeasureMap(scale.drives(seed), count, first=apart * draw)
-        for seed in range(seeds)
-        for draw in range(draws)
-    ]
+def _whole_maps(scale: Scale, variant: Variant, config: MapperConfig) -> list[MeasureMap]:
+    """Maps of as many drives as figures are compared at, seed by seed; those without errors other studies have too."""
+    maps = our_maps(scale, scale.journeys)[: scale.whole_fleet_seeds]
+    if variant != RIGHT:
+        maps = [replace(task, simulation=variant.spoil(task.simulation)) for task in maps]
+    return [replace(task, config=config) for task in maps]
 
 
-def paper_heads(scale: Scale, count: int, *, seeds: int | None = None) -> list[MeasureMap]:
-    """The cluster heads of the paper's method, of the same signs; its lanes have no part in them.
-
-    Of a single journey it has none: singletons are discarded.
-    """
-    if seeds is None:
-        seeds = scale.curve_seeds if count != scale.journeys else scale.preset_seeds
-    return [
-        MeasureMap(scale.drives(seed, lanes=False), count, config=PAPER, adjusted=False)
-        for seed in range(seeds)
-    ]
+Found = Mapping[tuple[Variant, str], list[Result]]
+"""Results by variant and calibration."""
 
 
-def curve(
-    scale: Scale, maps: Mapping[int, Sequence[MeasureMap]], folder: StudyFolder
-) -> dict[int, list[Result]]:
-    """Results by the number of journeys, like compared with like.
-
-    Up to the number that counts, those of the seeds alone that are done at every number.
-    """
-    seeds_done = [
-        {task.simulation.seed for task in tasks}
-        - {task.simulation.seed for task in tasks if not task.is_done(folder)}
-        for count, tasks in maps.items()
-        if count <= scale.journeys
-    ]
-    seeds = set.intersection(*seeds_done)
-    return {
-        count: results(
-            [t for t in tasks if count > scale.journeys or t.simulation.seed in seeds], folder
+def _rows(found: Found) -> tuple[tuple[Cell, ...], ...]:
+    right = found[RIGHT, "off"]
+    rows = []
+    for (variant, calibration), maps in found.items():
+        signs = numbers(maps, "map.uncertainty.signs")
+        values = {title: spread_of(maps, path).mean for title, path in _NUMBERS.items()}
+        rows.append(
+            (
+                variant.error,
+                variant.factor if variant != RIGHT else 0.0,
+                calibration,
+                *values.values(),
+                100 * weighted_mean(numbers(maps, "map.uncertainty.coverage"), signs),
+                weighted_mean(numbers(maps, "map.uncertainty.mean_nees"), signs),
+                values["relative [m]"] / spread_of(right, _RELATIVE).mean,
+                values["lane lateral [m]"] / spread_of(right, _LATERAL).mean,
+                len(maps),
+            )
         )
-        for count, tasks in maps.items()
-    }
+    return tuple(rows)
 
 
-def in_short_turns(
-    first: int, variants: Iterable[Sequence[MeasureMap]]
-) -> Iterator[tuple[int, MeasureMap]]:
-    """The maps of all variants with their turns, seed after seed from turn `first` on."""
-    for maps in variants:
-        for task in maps:
-            yield first + SHORT_TURNS * task.simulation.seed, task
+def _bars(found: Found) -> dict[str, dict[str, tuple[float, float]]]:
+    """Relative errors by variant: the heads', and with each calibration."""
+    bars: dict[str, dict[str, tuple[float, float]]] = {}
+    for (variant, calibration), maps in found.items():
+        times = f" x {variant.factor:g}" if variant != RIGHT else ""
+        group = bars.setdefault(f"{variant.error}{times}", {})
+        group.setdefault("cluster heads", spread_of(maps, _HEADS).bar)
+        group[f"calibration {calibration}"] = spread_of(maps, _RELATIVE).bar
+    return bars
 
 
-def in_turns(scale: Scale, maps: Iterable[MeasureMap]) -> Iterator[tuple[int, MeasureMap]]:
-    """Each with its turn: seed after seed, those at the number of journeys that counts twice as fast as the others.
-
-    Those of the most journeys take as long as all the others of a seed, and come last of the curves.
-    """
-    for task in maps:
-        if task.count > scale.journeys:
-            yield 2 * scale.curve_seeds + task.simulation.seed, task
-        else:
-            yield task.simulation.seed * (1 if task.count == scale.journeys else 2), task
+STUDY = Study("fleet", "What real fleets get wrong", tasks, chapter)
+add_arguments, run = STUDY.add_arguments, STUDY.run

@@ -9,9 +9,9 @@ from scipy.stats import chi2
 
 from crowdmap_torch.studies.chapter import Cell, Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, plot_lines
-from crowdmap_torch.studies.fleet import honest_maps
 from crowdmap_torch.studies.folder import StudyFolder
-from crowdmap_torch.studies.numbers import numbers, results
+from crowdmap_torch.studies.maps import honest_maps
+from crowdmap_torch.studies.numbers import numbers, results, weighted_mean
 from crowdmap_torch.studies.scale import SHORT_TURNS
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import Task
@@ -95,7 +95,7 @@ def _over_all_sets(values: Values) -> tuple[tuple[Cell, ...], ...]:
         ("lane points inside 1.96 sigma [%]", "lanes", metres, asked),
     )
     return tuple(
-        (title, _weighted(values[name], weight), said) for title, name, weight, said in judged
+        (title, weighted_mean(values[name], weight), said) for title, name, weight, said in judged
     )
 
 
@@ -121,11 +121,6 @@ def _panels(values: Values) -> list[Panel]:
         Panel(title, [Line(label, seeds, values[name]) for label, name in lines.items()])
         for title, lines in drawn.items()
     ]
-
-
-def _weighted(values: list[float], weights: list[float]) -> float:
-    total = sum(weights)
-    return sum(v * w for v, w in zip(values, weights, strict=True)) / total if total else math.nan
 
 
 STUDY = Study("honesty", "Does the map know how wrong it is?", tasks, chapter)

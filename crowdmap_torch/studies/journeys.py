@@ -10,8 +10,8 @@ from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.studies import paper
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, Point, plot_lines
-from crowdmap_torch.studies.fleet import curve, in_turns, our_maps, paper_heads
 from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.maps import curve, in_turns, our_maps, paper_heads
 from crowdmap_torch.studies.numbers import (
     Result,
     numbers,

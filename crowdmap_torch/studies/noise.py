@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Panel, line_of, plot_lines
-from crowdmap_torch.studies.fleet import in_short_turns, short_maps
 from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.maps import in_short_turns, short_maps
 from crowdmap_torch.studies.numbers import results, spreads
 from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study

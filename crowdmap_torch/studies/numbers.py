@@ -85,6 +85,12 @@ def pooled_std(found: Sequence[Result], path: str) -> float:
     return math.sqrt(float(np.average(std**2 + (mean - middle) ** 2, weights=count)))
 
 
+def weighted_mean(values: Sequence[float], weights: Sequence[float]) -> float:
+    """The mean of values that count differently; NaN of nothing."""
+    total = sum(weights)
+    return sum(v * w for v, w in zip(values, weights, strict=True)) / total if total else math.nan
+
+
 def seconds(found: Sequence[Result]) -> float:
     """Seconds of a core that the results took."""
     total = 0.0

@@ -9,8 +9,8 @@ from crowdmap_torch.simulate.positioning import POSITIONING_PRESETS, Positioning
 from crowdmap_torch.studies import paper
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import Panel, Point, line_of, plot_lines
-from crowdmap_torch.studies.fleet import curve, paper_heads
 from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.maps import curve, paper_heads
 from crowdmap_torch.studies.numbers import results, spread_of
 from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study

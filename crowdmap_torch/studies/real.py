@@ -8,8 +8,8 @@ from dataclasses import replace
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.studies.chapter import Chapter, Table
-from crowdmap_torch.studies.fleet import OURS, PAPER
 from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.maps import OURS, PAPER
 from crowdmap_torch.studies.numbers import number
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureReal, Task

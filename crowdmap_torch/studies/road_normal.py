@@ -8,8 +8,8 @@ from dataclasses import replace
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.curves import plot_bars
-from crowdmap_torch.studies.fleet import OURS, in_short_turns, short_maps
 from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.maps import OURS, in_short_turns, short_maps
 from crowdmap_torch.studies.numbers import results, spread_of
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import Task

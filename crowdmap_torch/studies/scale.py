@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from crowdmap_torch.simulate.dataset import SimulationConfig
+from crowdmap_torch.simulate.fleet import FleetConfig
 from crowdmap_torch.simulate.positioning import POSITIONING_PRESETS
 from crowdmap_torch.simulate.rigs import RigConfig
+from crowdmap_torch.simulate.roads import RoadShape
 from crowdmap_torch.simulate.vehicle import VehicleConfig
 from crowdmap_torch.simulate.worlds import WORLD_PRESETS, WorldConfig
 
@@ -49,6 +51,23 @@ class Scale:
     """Journeys on the short road whose map's covariances are judged."""
     honest_sets: int = 60
     """Data sets of them."""
+    fleet_road: WorldConfig = field(
+        default_factory=lambda: replace(WORLD_PRESETS["suburb"], length_m=400.0)
+    )
+    """Where real fleets' errors are looked at one by one."""
+    straight_road: WorldConfig = field(default_factory=lambda: WORLD_PRESETS["motorway"])
+    """Where little of them can be seen."""
+    fleet_journeys: int = 10
+    """Journeys on either."""
+    fleet_vehicles: int = 4
+    """That drive them in turn."""
+    fleet_seeds: int = 3
+    whole_fleet_seeds: int = 5
+    """Seeds at `journeys` that are driven by a fleet with all errors."""
+    fleet_errors: int | None = None
+    """Errors that are looked at alone; None: all."""
+    fleet_factors: int = 2
+    """How many of their sizes."""
     linear_sets: int = 8
     """Those of them that the linear estimator is given too."""
     draws: int = 3
@@ -81,6 +100,17 @@ class Scale:
             seed=seed,
         )
 
+    def fleet_drives(self, seed: int, *, straight: bool = False) -> SimulationConfig:
+        """Drives of a few vehicles that come back, which get nothing wrong as yet."""
+        return SimulationConfig(
+            world=self.straight_road if straight else self.fleet_road,
+            vehicle=self.vehicle,
+            rig=self.rig,
+            fleet=FleetConfig(vehicles=self.fleet_vehicles),
+            journeys=self.fleet_journeys,
+            seed=seed,
+        )
+
 
 def without_lanes(simulation: SimulationConfig) -> SimulationConfig:
     """The same drives, their lane detector switched off."""
@@ -110,6 +140,14 @@ QUICK = Scale(
     short_seeds=1,
     honest_journeys=3,
     honest_sets=1,
+    fleet_road=_HOUSES,
+    straight_road=replace(_HOUSES, road=RoadShape(heading_deg=0.0, grade=0.0, bank_deg=0.0)),
+    fleet_journeys=2,
+    fleet_vehicles=2,
+    fleet_seeds=1,
+    whole_fleet_seeds=1,
+    fleet_errors=1,
+    fleet_factors=1,
     linear_sets=1,
     draws=1,
     noise_steps=1,

@@ -3,64 +3,102 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from crowdmap_torch.studies.fleet import (
-    curve,
-    in_short_turns,
-    in_turns,
-    our_maps,
-    paper_heads,
-    short_maps,
-)
+import pytest
+from worlds.studied import errors, figures, fill, measured, rows, work
+
+from crowdmap_torch.simulate.errors import ERRORS
+from crowdmap_torch.studies import fleet
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.scale import FULL
+from crowdmap_torch.studies.study import Settings
 
-SCALE = replace(FULL, counts=(1, 5, 10, 20), journeys=10, seeds=3, curve_seeds=2, most_seeds=1)
+ONE_SEED = Settings(
+    replace(
+        FULL,
+        fleet_seeds=1,
+        whole_fleet_seeds=1,
+        fleet_errors=2,
+        fleet_journeys=2,
+        journeys=3,
+        counts=(3,),
+    ),
+    None,
+)
 
 
-def test_a_curve_has_the_same_seeds_at_every_number(tmp_path: Path):
+def by_error(table) -> dict[tuple[str, float, str], dict[str, object]]:
+    named = [dict(zip(table.columns, row, strict=True)) for row in rows(table)]
+    return {(row["error"], row["times"], row["calibration"]): row for row in named}
+
+
+def test_each_error_comes_alone_and_at_twice_its_size_and_all_together():
+    found = {(v.error, v.factor) for v in fleet.variants(FULL)}
+    assert found == {("none", 1.0)} | {(e, f) for e in (*ERRORS, "fleet") for f in (1.0, 2.0)}
+
+
+def test_variants_differ_in_their_errors_and_nothing_else():
+    right, *wrong = (v.spoil(FULL.fleet_drives(3)) for v in fleet.variants(FULL))
+    assert right == FULL.fleet_drives(3)
+    for drives in wrong:
+        assert drives != right and drives.fleet.vehicles == right.fleet.vehicles
+        same = {name: getattr(right, name) for name in ("fleet", "positioning", "signs")}
+        assert replace(drives, **same) == right
+
+
+def test_drives_without_errors_are_those_of_other_studies():
+    scale = ONE_SEED.scale
+    whole = [t for t in work(fleet, ONE_SEED) if t.count == scale.journeys]
+    assert whole[0].simulation == scale.drives(0)
+    assert whole[1].simulation.fleet.vehicles == 8
+
+
+def test_errors_are_told_beside_the_drives_without_them(folder: StudyFolder):
+    def result(task):
+        size = 1 + 100 * getattr(task.simulation.fleet, "focal_error", 0.0)
+        return measured(relative=0.1 * size, absolute=0.2)
+
+    fill(folder, work(fleet, ONE_SEED), result)
+    alone, straight, whole = map(by_error, fleet.chapter(ONE_SEED, folder).tables)
+    ratio = "relative / without errors"
+    assert alone["none", 0.0, "off"][ratio] == 1.0
+    assert alone["focals", 1.0, "off"][ratio] == pytest.approx(1.2)
+    assert alone["focals", 2.0, "off"][ratio] == pytest.approx(1.4)
+    assert alone["mounts", 2.0, "off"][ratio] == pytest.approx(1.0)
+    for pair in (straight, whole):
+        assert pair["fleet", 1.0, "off"][ratio] == pytest.approx(1.2)
+
+
+def test_coverage_counts_every_sign_once(tmp_path: Path):
+    settings = Settings(replace(ONE_SEED.scale, fleet_seeds=2, fleet_errors=0), None)
     folder = StudyFolder(tmp_path)
-    maps = {count: our_maps(SCALE, count) for count in SCALE.counts}
-    for tasks in maps.values():
-        for task in tasks:
-            folder.write_result(task.key, {"seed": task.simulation.seed})
-    found = curve(SCALE, maps, folder)
-    # The third seed is there at ten journeys alone; more than those have a seed of their own.
-    assert {n: {r["seed"] for r in results} for n, results in found.items()} == {
-        1: {0, 1},
-        5: {0, 1},
-        10: {0, 1},
-        20: {0},
-    }
-    (one_of_many, *_) = [task for task in maps[1] if task.simulation.seed == 1]
-    (tmp_path / "results" / f"{one_of_many.key}.json").unlink()
-    assert {r["seed"] for r in curve(SCALE, maps, folder)[10]} == {0}
+
+    def result(task):
+        of_map = figures(0.1, 0.2)
+        signs, inside = (30, 1.0) if task.simulation.seed else (10, 0.6)
+        of_map["uncertainty"] |= {"signs": signs, "coverage": inside}
+        return measured() | {"map": of_map, "clean": {"lane_width": errors(0.1)}}
+
+    fill(folder, work(fleet, settings), result)
+    table = by_error(fleet.chapter(settings, folder).tables[0])
+    assert table["none", 0.0, "off"]["inside 95 % [%]"] == pytest.approx(90.0)
 
 
-def test_few_journeys_are_other_ones_each_time():
-    maps = [task for task in our_maps(SCALE, 2) if task.simulation.seed == 0]
-    rows = [row for task in maps for row in task.rows]
-    assert len(maps) == SCALE.draws
-    assert len(set(rows)) == len(rows) and max(rows) < SCALE.journeys
-
-
-def test_what_decides_comes_first():
-    turns = {(t.simulation.seed, t.count): turn for turn, t in in_turns(SCALE, our_maps(SCALE, 10))}
-    assert [turns[seed, 10] for seed in range(3)] == [0, 1, 2]
-    ((turn, _),) = in_turns(SCALE, our_maps(SCALE, 20))
-    assert turn > max(turns.values())
-
-
-def test_the_papers_heads_have_no_lanes_and_the_same_signs():
-    ours, theirs = our_maps(SCALE, 10)[1].simulation, paper_heads(SCALE, 10)[1].simulation
-    assert theirs.lanes.max_lanes == 0
-    assert replace(theirs, lanes=ours.lanes) == ours
-
-
-def test_seeds_of_the_short_road_come_in_turn_whatever_the_variant():
-    worse = short_maps(SCALE, change=lambda drives: replace(drives, bad_drives=("jump",)))
-    assert all(task.simulation.bad_drives == ("jump",) for task in worse)
-    turns = [
-        (task.simulation.seed, turn) for turn, task in in_short_turns(2, [short_maps(SCALE), worse])
-    ]
-    assert turns[: len(worse)] == turns[len(worse) :]
-    assert [turn for _, turn in sorted(turns[: len(worse)])] == [2, 6, 10]
+def test_a_second_configuration_has_rows_and_work_of_its_own(
+    folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
+):
+    before = len(work(fleet, ONE_SEED))
+    other = replace(fleet.OURS, min_confidence=0.4)
+    monkeypatch.setattr(fleet, "CALIBRATIONS", {"off": fleet.OURS, "on": other})
+    tasks = work(fleet, ONE_SEED)
+    assert len(tasks) == 2 * before
+    fill(
+        folder,
+        tasks,
+        lambda task: measured(0.05 if getattr(task, "config", None) == other else 0.1),
+    )
+    table = by_error(fleet.chapter(ONE_SEED, folder).tables[0])
+    assert table["fleet", 1.0, "on"]["relative / without errors"] == pytest.approx(0.5)
+    # Single journeys are mapped once for both.
+    assert len({need.key for t in tasks for need in t.needs()}) == len(
+        {need.key for t in tasks if t.config == fleet.OURS for need in t.needs()}
+    )

@@ -5,7 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from crowdmap_torch.studies.numbers import number, pooled_std, seconds, spread, spreads
+from crowdmap_torch.studies.numbers import (
+    number,
+    pooled_std,
+    seconds,
+    spread,
+    spreads,
+    weighted_mean,
+)
 
 
 def errors(values: np.ndarray) -> dict:
@@ -43,3 +50,8 @@ def test_spreads_have_their_titles_and_bars_are_mean_and_sigma():
     row = spreads(found, {"title": "a.b", "missing": "a.c"})
     assert row["title"].bar == (2.0, 1.0)
     assert row["missing"].count == 0
+
+
+def test_values_that_count_more_draw_the_mean_to_them():
+    assert weighted_mean([1.0, 4.0], [2.0, 1.0]) == 2.0
+    assert math.isnan(weighted_mean([], []))

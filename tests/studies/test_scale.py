@@ -31,6 +31,9 @@ def test_the_quick_scale_is_smaller_in_everything():
         "short_seeds",
         "honest_sets",
         "noise_steps",
+        "fleet_seeds",
+        "whole_fleet_seeds",
+        "fleet_factors",
     ):
         assert getattr(QUICK, name) < getattr(FULL, name)
     assert QUICK.road.length_m < FULL.road.length_m
