@@ -14,6 +14,7 @@ from types import TracebackType
 import torch
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
 from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboard.summary.writer.record_writer import RecordWriter
@@ -29,10 +30,14 @@ _MAX_SAMPLES = 200_000
 
 
 class _Events:
-    """An event file, written by whoever logs: an OSError is raised where it happens, not in a thread beside."""
+    """An event file, written by whoever logs: an OSError is raised where it happens, not in a thread beside.
+
+    What stands in the folder's other files, left by a run that was interrupted, is not written again.
+    """
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
+        self._written = _written(folder)
         name = f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}.{os.getpid()}"
         number = sum(path.name.startswith(name) for path in folder.iterdir())
         self._path = folder / f"{name}.{number}"
@@ -42,7 +47,8 @@ class _Events:
 
     def add_summary(self, summary: Summary, global_step: int | None = None, *_: object) -> None:
         """What SummaryWriter hands over."""
-        self._add(Event(wall_time=time.time(), step=global_step, summary=summary))
+        if not {(value.tag, global_step or 0) for value in summary.value} <= self._written:
+            self._add(Event(wall_time=time.time(), step=global_step, summary=summary))
 
     def flush(self) -> None:
         """What is written is in the file already."""
@@ -63,6 +69,16 @@ class _Events:
             yield
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self._path)) from error
+
+
+def _written(folder: Path) -> frozenset[tuple[str, int]]:
+    """Tags and steps of all that the event files of a folder hold; one that was cut off is read up to there."""
+    return frozenset(
+        (value.tag, event.step)
+        for path in sorted(folder.glob("events.out.tfevents.*"))
+        for event in map(Event.FromString, RawEventFileLoader(str(path)).Load())
+        for value in event.summary.value
+    )
 
 
 class _Writer(SummaryWriter):

@@ -16,7 +16,7 @@ from crowdmap_torch.config import MapperConfig, dump
 from crowdmap_torch.evaluation.evaluate import control_ids_of, evaluate_map, refuse_other_origin
 from crowdmap_torch.evaluation.evidence import read_journey_landmarks
 from crowdmap_torch.evaluation.map_figures import MapFigures
-from crowdmap_torch.io.atomic import atomic_file, drop_halves
+from crowdmap_torch.io.atomic import atomic_file, atomic_folder, drop_halves
 from crowdmap_torch.io.documents import plain, read_json, write_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.landmarks import write_lanes, write_signs
@@ -115,6 +115,18 @@ class RunFolder:
             shutil.rmtree(self.checkpoint, ignore_errors=True)
         drop_halves(self.path)
         self.unfinished.mkdir(exist_ok=True)
+        if self.resume:
+            self._take_back_events()
+
+    def _take_back_events(self) -> None:
+        """Copies the event files of a run that was cut when its result was in its place: no others show its stages."""
+        published = self.path / self.tensorboard.name
+        # Events are written before the first stage is kept: where there are none beside stages, they were moved.
+        is_ours = any(self.checkpoint.rglob("*.pt")) and not self.tensorboard.exists()
+        if is_ours and published.is_dir():
+            with atomic_folder(self.tensorboard) as beside:
+                for path in published.glob("events.out.tfevents.*"):
+                    shutil.copy2(path, beside / path.name)
 
     def kept(self) -> str:
         """What there is of the run, should it end before its time."""

@@ -145,6 +145,11 @@ def assert_board_shows_all_once(folder: Path, *, journeys: int, steps: int) -> N
     for tag in board.Tags()["scalars"]:
         logged = [event.step for event in board.Scalars(tag)]
         assert len(set(logged)) == len(logged), tag
+    # A run cut after its last stage draws the finished map anew, and logs it once.
+    images = [event.step for event in board.Images("map/after")]
+    assert images == [steps]
+    assert len(board.Images("map/before")) == 1
+    assert len(board.Tensors("config/text_summary")) == 1
     assert len(board.Scalars("association/sign_tracklets")) == journeys
     assert len(board.Scalars("bias/up_m")) == journeys
     assert len(board.Scalars("cost/total")) == steps
@@ -182,6 +187,7 @@ def test_a_run_cut_again_and_again_repeats_nothing_and_ends_with_the_same_bits(
         **{"finish_map": 2, "metrics_of": 1},
     }
     assert same_map(out, run)
+    assert_board_shows_all_once(out / "tensorboard", journeys=3, steps=steps)
     resumed, whole = (json.loads((r / "metrics.json").read_text()) for r in (out, run))
     for name in ("costs", "outcome", "counts", "journeys", "survey"):
         assert resumed[name] == whole[name]

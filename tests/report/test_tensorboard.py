@@ -57,6 +57,23 @@ def test_the_config_and_the_maps_are_there(record, tmp_path: Path):
     assert events.Tags()["tensors"] == ["config/text_summary"]
 
 
+def test_what_a_run_logged_before_it_was_cut_is_not_logged_again(tmp_path: Path):
+    for cut in (True, False):
+        with TensorBoardLog(tmp_path) as log:
+            log.log_config("a: 1")
+            log.log_scalars({"cost/total": 2.0}, 1)
+            log.log_histogram("residual/sign", torch.arange(4.0), 1)
+            log.log_scalars({"cost/total": 1.0}, 2)
+        if cut:
+            # In the midst of its last record.
+            (path,) = tmp_path.iterdir()
+            path.write_bytes(path.read_bytes()[:-9])
+    events = read(tmp_path)
+    assert [event.step for event in events.Scalars("cost/total")] == [1, 2]
+    assert len(events.Histograms("residual/sign")) == 1
+    assert len(events.Tensors("config/text_summary")) == 1
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
 def test_a_full_disk_is_an_error_where_it_happens(tmp_path: Path, monkeypatch):
     with pytest.raises(OSError, match=r"No space left on device: '.*tfevents"):
