@@ -239,7 +239,12 @@ def first_map(
         lanes = clusters.heads
         support = support_of_pieces(pieces, clusters.label, config.lane_join.sample_spacing_m)
     else:
-        moved = [unbiased_lanes(p, drift) for p, drift in zip(made, drifts, strict=True)]
+        # Bad drives leave nothing behind: where they are off is not known well enough to move their pieces.
+        trusted = (crowd.journey_weight > 0).tolist()
+        moved = [
+            unbiased_lanes(pieces if is_good else pieces.select(pieces.journey[:0]), drift)
+            for pieces, drift, is_good in zip(made, drifts, trusted, strict=True)
+        ]
         joined = join_lanes(concatenate_lanes(moved), config.positioning, config.lane_join)
         lanes, support = joined.lanes, joined.support
     return FirstMap(

@@ -19,7 +19,14 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import Truth
-from crowdmap_torch.mapper import MapResult, build_map, map_journeys
+from crowdmap_torch.mapper import (
+    MapResult,
+    build_bundle,
+    build_map,
+    first_map,
+    map_journey,
+    map_journeys,
+)
 from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.tables import Dataset, HdMap, Journey
 
@@ -165,6 +172,33 @@ def test_signs_of_journeys_that_share_nothing_are_tentative(tiny: Dataset):
     result = build_map(replace(tiny, journeys=journeys), CONFIG)
     assert len(certain_part(result.hd_map, CONFIG.min_confidence).signs) == 0
     assert result.hd_map.signs.journey.unique().tolist() == [0, 1]
+
+
+def test_a_bad_drive_leaves_nothing_behind(tiny: Dataset, tiny_result: MapResult):
+    # A heading that is three degrees off: lanes lie beside those of others, and signs are turned.
+    spoilt = tiny.journeys[0]
+    T = spoilt.T_world_camera.clone()
+    yaw = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi / 60]).to(T)
+    T[:, :3, :3] = se3.exp(yaw)[:3, :3] @ T[:, :3, :3]
+    bad = replace(spoilt, journey_id="bad", T_world_camera=T)
+    journeys = (*tiny.journeys, bad)
+    number = len(tiny.journeys)
+    maps = (*tiny_result.journey_maps, map_journey(bad, number, CONFIG))
+    assert len(maps[-1].lanes) and len(maps[-1].signs)
+    first, alone = first_map(journeys, maps, CONFIG), tiny_result.first
+    assert [o.journey for o in first.crowd.report.outlier_journeys] == [number]
+    assert number not in first.lane_support.journey
+    assert number not in first.tentative.journey
+    lengths = [
+        spline_length.arc_length_flat(f.lanes.control.point_world, f.lanes.control_count)
+        for f in (first, alone)
+    ]
+    assert len(lengths[0]) == len(lengths[1])
+    assert (lengths[0] - lengths[1]).abs().max() < 1.0
+    assert torch.equal(first.lanes.n_journeys, alone.lanes.n_journeys)
+    bundle = build_bundle(journeys, maps, first, CONFIG)
+    frames = torch.tensor([len(j.t_ns) for j in journeys]).cumsum(0)
+    assert int(bundle.frame.max()) < int(frames[-2])
 
 
 def test_inputs_are_left_as_they_were(tiny: Dataset):
