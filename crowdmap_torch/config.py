@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import yaml
 
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.crowd_lanes.cluster import LaneClusterConfig
 from crowdmap_torch.crowd_lanes.join import LaneJoinConfig
@@ -68,6 +69,8 @@ class MapperConfig(Settings):
     """V-A.2, with `method: paper2017`."""
     adjust: AdjustConfig = field(default_factory=AdjustConfig)
     """V-B: bundle adjustment."""
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    """What cars may have wrong for good: unknowns of the adjustment."""
     control: ControlConfig = field(default_factory=ControlConfig)
     """Surveyed signs that pin the map: which of the map's they are."""
     seed: Seed = 0
@@ -103,6 +106,7 @@ class MapperConfig(Settings):
                 habit=SignHabit(facing_rad=math.inf, upright_rad=math.inf, log_size=math.inf),
                 lane_height_sigma_m=math.inf,
             ),
+            calibration=CalibrationConfig.off(),
         )
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import KnownCalibration
 from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
 from crowdmap_torch.adjustment.lane_matching import detection_lanes
 from crowdmap_torch.config import MapperConfig, config_hash
@@ -267,8 +268,12 @@ def build_bundle(
     config: MapperConfig,
     *,
     control: SurveySigns | None = None,
+    known_cars: Mapping[str, KnownCalibration] | None = None,
 ) -> Bundle:
-    """Section V-B: the unknowns and observations of bundle adjustment; signs that are in `control` pin the map."""
+    """Section V-B: the unknowns and observations of bundle adjustment.
+
+    Signs that are in `control` pin the map; of some cars the calibration may be known already, by name.
+    """
     config = config.resolved()
     return adjust.build(
         journeys,
@@ -282,6 +287,8 @@ def build_bundle(
         lane_tracklets=[m.lane_tracklets for m in maps],
         lane_support=first.lane_support,
         left_out=[outlier.journey for outlier in first.crowd.report.outlier_journeys],
+        calibration=config.calibration,
+        known_cars=known_cars,
         control=None
         if control is None
         else find_control_signs(first.signs, control, config.control),

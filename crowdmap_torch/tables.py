@@ -150,6 +150,13 @@ class Journey:
     lane_points: LanePoints
     dropped: dict[str, int]
     """Detections dropped at the door for a fault of their geometry, by reason."""
+    vehicle_id: str = ""
+    """Whose drives share a calibration; empty: those of the rig do."""
+
+    @property
+    def vehicle(self) -> str:
+        """The name of what its calibration is of."""
+        return self.vehicle_id or self.rig.rig_id
 
     @property
     def frame_count(self) -> int:

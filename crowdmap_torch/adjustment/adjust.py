@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from crowdmap_torch.adjustment.bundle import Bundle, Observations, Priors, Unknowns
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import CalibrationConfig, KnownCalibration, fleet_of
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes, supported_lanes
@@ -29,6 +30,7 @@ from crowdmap_torch.adjustment.observations import (
     lane_point_observations,
     spaced_frames,
 )
+from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
 from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.geometry.trajectory import station
@@ -63,12 +65,15 @@ def build(
     lane_support: LaneSupport | None = None,
     left_out: Collection[int] = (),
     control: ControlSigns | None = None,
+    calibration: CalibrationConfig | None = None,
+    known_cars: Mapping[str, KnownCalibration] | None = None,
 ) -> Bundle:
     """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
 
     `drifts` are tangents per frame, from the positioning module's pose to the start pose. Journeys `left_out`, by
     number, have no say. Signs that are `control` points are held where they were surveyed. Lane points keep the lane that
-    `lane_support` has for the journeys' `lane_tracklets` there, where it has one; others go to the nearest lane.
+    `lane_support` has for the journeys' `lane_tracklets` there, where it has one; others go to the nearest lane. What cars
+    may have wrong `calibration` says, None: nothing; and what is known of some of them `known_cars`.
     """
     given = torch.cat([journey.T_world_camera for journey in journeys])
     drift = torch.cat(list(drifts))
@@ -96,11 +101,15 @@ def build(
         "size": signs.size,
         "lane": spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count),
     }
+    unknown = calibration or CalibrationConfig.off()
+    of_frame = nodes.journey[nodes.of_frame]
+    fleet = fleet_of(journeys, frame, of_frame, unknown, known_cars or {})
+    values |= {name: fleet.expected[name] for name in fleet.variables}
     poses = pose_prior(
         journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior
     )
     fixed = _fixed_terms(values, signs, lanes, observed.corners, control, config)
-    priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]))
+    priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet)
     return Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
 
 

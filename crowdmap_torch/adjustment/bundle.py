@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from crowdmap_torch.adjustment.calibration import ByOptics
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
 from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
-from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
+from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
 from crowdmap_torch.geometry import se3, spline_basis
-from crowdmap_torch.geometry.camera import Camera
-from crowdmap_torch.noise.pose_prior import PosePrior
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
 from crowdmap_torch.optim.problem import (
@@ -61,52 +60,6 @@ VARIABLES = {
 """The unknowns: camera poses, their slow errors and each journey's constant one; signs, their sides, lanes' coefficients."""
 
 
-@dataclass(frozen=True)
-class Unknowns:
-    """Where the unknowns start, and what they are of."""
-
-    values: dict[str, Tensor]
-    """By name of `VARIABLES`."""
-    frame: Int[Tensor, " p"]
-    """Frame of each pose, counted over all journeys."""
-    lane_count: Int[Tensor, " n"]
-    """Coefficients of each lane."""
-
-
-@dataclass(frozen=True)
-class Observations:
-    """What images say of them."""
-
-    corners: CornerObservations
-    lane_points: LanePointObservations
-    matches: LaneMatches
-    """Where each lane point starts."""
-    lenses: tuple[Camera, ...]
-    """The cameras that they were seen by."""
-
-    def renumbered(self, row_of_frame: Int[Tensor, " f"]) -> Observations:
-        """Those of the frames that have a row, by rows; -1: the frame has none."""
-        corner, point = row_of_frame[self.corners.frame], row_of_frame[self.lane_points.frame]
-        of_corner, of_point = corner >= 0, point >= 0
-        return Observations(
-            replace(self.corners[of_corner], frame=corner[of_corner]),
-            replace(self.lane_points[of_point], frame=point[of_point]),
-            self.matches[of_point],
-            self.lenses,
-        )
-
-
-@dataclass(frozen=True)
-class Priors:
-    """What is known of them before."""
-
-    poses: PosePrior
-    fixed: dict[str, CostTerm]
-    """Of signs and lanes: terms that stay as they are."""
-    beside: Int[Tensor, " c"]
-    """The pose nearest to each lane coefficient at the start."""
-
-
 class Bundle(nn.Module):
     """The unknowns of bundle adjustment and all observations of them.
 
@@ -137,7 +90,12 @@ class Bundle(nn.Module):
     ) -> None:
         super().__init__()
         values, corners = unknowns.values, observations.corners
-        self.variables = VARIABLES
+        self.fleet = priors.fleet
+        own = {
+            name: Variable(values[name].shape[1], euclidean, pull=pull_euclidean)
+            for name in self.fleet.variables
+        }
+        self.variables = VARIABLES | own
         self.names = tuple(values)
         for name, value in values.items():
             self.register_buffer(f"base_{name}", value.clone())
@@ -164,13 +122,19 @@ class Bundle(nn.Module):
         self.register_buffer("match_normal", matches.normal_px.clone())
         self.register_buffer("match_valid", matches.valid.clone())
         self.register_buffer("refreshed", torch.zeros_like(self.judged, dtype=torch.bool))
+        self._by_optics = tuple(
+            ByOptics.none(len(rows), self.fleet.config, rows.px, heights)
+            for rows, heights in ((self.corners, 0), (self.lane_points, 1))
+        )
         self._plan = self._elimination()
 
     @torch.no_grad()
     def _elimination(self) -> EliminationPlan:
         """Frames hang on the drift's chains, both are eliminated, the biases go last; landmarks ranked as they start."""
         nodes, seen = self.prior.nodes, {**self._corner_term(1.0), **self._lane_terms(1.0)}
-        plan = EliminationPlan("drift", nodes.journey, "pose", nodes.of_frame, border="bias")
+        shared = dict.fromkeys(self.fleet.variables, self.fleet.of_journey)
+        chain, of_frame = nodes.journey, nodes.of_frame
+        plan = EliminationPlan("drift", chain, "pose", of_frame, border="bias", shared=shared)
         values = self.values()
         return replace(plan, rank=landmark_rank(Problem(self.variables, seen), values, plan))
 
@@ -246,18 +210,22 @@ class Bundle(nn.Module):
     def relinearise(self) -> None:
         """Takes every lens as it is where the unknowns, and the splines' matches, have the points by now."""
         values, rows = self.values(), self.corners
+        by_corner, by_point = self._by_optics
         if len(rows):
             sign = values["sign"][rows.sign]
             corner = torch.nn.functional.pad(rows.template * values["size"][rows.sign], (0, 1))
             point = se3.transform(sign, corner)
             seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
-            self.corners = relinearised(rows, self.lenses, self._corners_by_lens, seen)
+            self.corners = rows = relinearised(rows, self.lenses, self._corners_by_lens, seen)
+            by_corner = self.fleet.by_optics(rows, self.lenses, seen, values["pose"])
         rows = self.lane_points
         if len(rows):
             coefficient, weight = self._windows()
             point = (weight[..., None] * values["lane"][coefficient]).sum(1)
             seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
             self.lane_points = relinearised(rows, self.lenses, self._lane_points_by_lens, seen)
+            by_point = self.fleet.by_optics(self.lane_points, self.lenses, seen, values["pose"])
+        self._by_optics = (by_corner, by_point)
 
     @torch.no_grad()
     def judge(self, backend: MapBackend) -> bool:
@@ -327,7 +295,8 @@ class Bundle(nn.Module):
     def _terms(self, prior_scale: Float[Tensor, "j 3"]) -> dict[str, CostTerm]:
         if not bool(self.refreshed):
             self.refresh()
-        terms = {**self.prior.terms(prior_scale), **self.fixed}
+        terms = {**self.prior.terms(prior_scale), **self.fleet.priors(), **self.fixed}
+        terms["pose_white"] = self.fleet.of_poses(terms["pose_white"])
         terms.update(self._size_term())
         terms.update(self._corner_term(self.corner_sigma()))
         terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))
@@ -353,7 +322,7 @@ class Bundle(nn.Module):
             loss,
             reprojection.sign_reprojection_jacobian,
         )
-        return {"sign_reprojection": term}
+        return {"sign_reprojection": self.fleet.of_corners(term, rows, self._by_optics[0])}
 
     def _loss_of_detections(self) -> JointTukey:
         """The loss of whole detections, those that are given up of no account."""
@@ -422,7 +391,8 @@ class Bundle(nn.Module):
             Tukey(self.config.tukey_c),
             lane.lane_height_jacobian,
         )
-        return {"lane_reprojection": image, "lane_height": height}
+        terms = {"lane_reprojection": image, "lane_height": height}
+        return self.fleet.of_lane_points(terms, rows, self.matches.normal_px, self._by_optics[1])
 
     def _windows(self) -> tuple[Int[Tensor, "m 4"], Float[Tensor, "m 4"]]:
         """The four coefficients of the spline point that each lane point is held against, and their weights."""

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.found_calibration import FleetCalibration, found_calibration
 from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.optim.problem import Values
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, MapCovariance
@@ -39,6 +40,8 @@ class MapUncertainty:
     """By journey the mean error of its poses along the way, the adjusted minus the given ones: east, north, up [m] and
     heading [rad], counted from east to north. NaN for journeys that had no say."""
     bias_covariance: Float[Tensor, "j 4 4"]
+    calibration: FleetCalibration
+    """What cars have wrong for good; empty where that is not asked."""
 
 
 @torch.no_grad()
@@ -66,6 +69,7 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
         shared=(shared + shared.mT) / 2,
         bias=bias.masked_fill(silent[:, None], torch.nan),
         bias_covariance=of_bias.masked_fill(silent[:, None, None], torch.nan),
+        calibration=found_calibration(bundle, covariance),
     )
 
 

@@ -10,10 +10,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypedDict
 
 # Before torch: its threads then sleep while they wait, and do not spin. On a busy machine that is several times faster.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -22,6 +23,7 @@ import torch
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.calibration import CalibrationConfig, KnownCalibration
 from crowdmap_torch.config import MapperConfig, dump, load_config
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
@@ -43,6 +45,7 @@ from crowdmap_torch.report.record import record_of
 from crowdmap_torch.report.stages import keep_and_log, log_crowd
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.report.watch import Watch
+from crowdmap_torch.runs.calibration import read_found
 from crowdmap_torch.runs.checkpoint import Checkpoint, Found, inputs_of
 from crowdmap_torch.runs.folder import (
     RunFolder,
@@ -55,6 +58,8 @@ from crowdmap_torch.runs.folder import (
 from crowdmap_torch.runs.metrics import metrics_of
 from crowdmap_torch.tables import Dataset, RejectedJourney, Survey, SurveySigns, to_device
 
+_OFF = "off"
+"""`--calibration off`."""
 EMPTY_MAP = 3
 """Exit code with `--strict` where a map was written without the signs or lanes that were detected."""
 
@@ -66,6 +71,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="YAML", help="what differs from defaults")
     parser.add_argument(
         "--control", type=Path, metavar="MAP", help="surveyed signs that pin the map, as a survey"
+    )
+    parser.add_argument(
+        "--calibration",
+        metavar="RUN|off",
+        help="start from what an earlier run found of the cars; off: rig.yaml is right in all of them",
     )
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
     parser.add_argument(
@@ -95,6 +105,8 @@ def run(options: argparse.Namespace) -> int:
         refuse_overlap(options.out, options.dataset)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         config = load_config(options.config)
+        if options.calibration == _OFF:
+            config = replace(config, calibration=CalibrationConfig.off())
         device = _device(options.device)
     # The folder first: whether it can be written, and by nobody else, is known before anything is read at length.
     with keeping(folder.kept), folder.claimed(), one_core_each():
@@ -107,7 +119,7 @@ def _map(
     with input_read():
         given = _read(options, config, device)
         dataset, survey, truth = given.dataset, given.survey, given.truth
-        inputs = inputs_of(dataset, config, survey, truth, given.control, device=device)
+        inputs = inputs_of(dataset, config, survey, truth, given.control, given.cars, device=device)
         kept = Checkpoint(folder.checkpoint, inputs)
         found = _take_up(kept, folder, len(dataset.journeys), device) if options.resume else Found()
     if found is None:
@@ -139,7 +151,7 @@ def _map(
 
         # ---- everything at once (section V-B) ----
         progress("bundle adjustment: building")
-        bundle = mapper.build_bundle(journeys, maps, first, config, control=given.pins(device))
+        bundle = mapper.build_bundle(journeys, maps, first, config, **given.beside(device))
         watch = Watch(log, survey, first.signs, first.lanes, every=options.log_every)
         step = found.step
         begun = adjust.start(bundle) if step is None else adjust.go_on(bundle, step.standing)
@@ -193,6 +205,11 @@ def _spared(what: str) -> Iterator[None]:
         print(f"looks wrong: no {what} could be made ({reason}); the map is whole", file=sys.stderr)
 
 
+class _Beside(TypedDict):
+    control: SurveySigns | None
+    known_cars: Mapping[str, KnownCalibration]
+
+
 @dataclass(frozen=True)
 class _Given:
     dataset: Dataset
@@ -200,9 +217,13 @@ class _Given:
     truth: Truth | None
     control: Survey | None
     """Surveyed signs that pin the map."""
+    cars: Mapping[str, KnownCalibration]
+    """What an earlier run found of their calibrations."""
 
-    def pins(self, device: torch.device) -> SurveySigns | None:
-        return None if self.control is None else self.control.signs.to(device)
+    def beside(self, device: torch.device) -> _Beside:
+        """What is known beside the drives, for the bundle."""
+        pins = None if self.control is None else self.control.signs.to(device)
+        return {"control": pins, "known_cars": self.cars}
 
 
 def _read(options: argparse.Namespace, config: MapperConfig, device: torch.device) -> _Given:
@@ -213,7 +234,12 @@ def _read(options: argparse.Namespace, config: MapperConfig, device: torch.devic
         truth = read_truth_of(options.dataset, dataset, survey)
     with reading(config.reading):
         control = options.control and read_survey_at(options.control, dataset.origin)
-    return _Given(dataset, survey, truth, control)
+        earlier = options.calibration
+        cars = {} if earlier in (None, _OFF) else read_found(Path(earlier))
+    if cars and (new := sorted({journey.vehicle for journey in dataset.journeys} - cars.keys())):
+        names = ", ".join(new[:5]) + (f" and {len(new) - 5} others" if len(new) > 5 else "")
+        print(f"--calibration {earlier}: nothing is known of {names}", file=sys.stderr)
+    return _Given(dataset, survey, truth, control, cars)
 
 
 def _load(folder: Path, device: torch.device, *, strict: bool) -> Dataset:

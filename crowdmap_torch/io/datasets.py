@@ -179,8 +179,14 @@ def _load_journey(
         lanes=lanes.detections,
         lane_points=lanes.points,
         dropped=signs.dropped | lanes.dropped,
+        vehicle_id=_vehicle_id(head.content.get("vehicle_id")),
     )
     return journey, signs.type_names
+
+
+def _vehicle_id(stated: object) -> str:
+    """A name, or a number for one; whatever else is there names nobody."""
+    return str(stated) if isinstance(stated, str | int) and not isinstance(stated, bool) else ""
 
 
 def _copies(journeys: Sequence[Journey]) -> dict[str, str]:

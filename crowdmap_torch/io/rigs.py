@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -58,6 +59,34 @@ def read_camera(folder: Path) -> Camera:
     rig = read_yaml(folder / "rig.yaml")
     rig.allow(("camera",), ("road", "mount"))
     return _read_camera(rig.part("camera"))
+
+
+def rig_yaml(
+    camera: Camera,
+    road_normal_camera: Iterable[float],
+    camera_height: float,
+    mount: tuple[str, str, str] | None = None,
+) -> str:
+    """The text of rig.yaml; `mount` are its URDF file, the link of the poses and that of the camera."""
+    K = camera.K.tolist()
+    lines = [
+        "camera:",
+        f"  model: {camera.model}",
+        f"  width: {camera.width}",
+        f"  height: {camera.height}",
+        f"  fx: {K[0][0]!r}",
+        f"  fy: {K[1][1]!r}",
+        f"  cx: {K[0][2]!r}",
+        f"  cy: {K[1][2]!r}",
+        f"  distortion: [{', '.join(repr(float(k)) for k in camera.distortion)}]",
+        "road:",
+        f"  normal: [{', '.join(repr(float(x)) for x in road_normal_camera)}]",
+        f"  height_m: {camera_height!r}",
+    ]
+    if mount is not None:
+        names = ("urdf", "pose_link", "camera_link")
+        lines += ["mount:", *(f"  {k}: {v}" for k, v in zip(names, mount, strict=True))]
+    return "\n".join(lines) + "\n"
 
 
 def _read_camera(section: Document) -> Camera:

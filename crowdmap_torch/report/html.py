@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.report import plots
 from crowdmap_torch.report.assets import SCRIPT, STYLE
+from crowdmap_torch.report.calibration import calibration_table, plot_calibration
 from crowdmap_torch.report.map_svg import map_svg
 from crowdmap_torch.report.record import RunRecord
 from crowdmap_torch.report.tables_html import (
@@ -62,6 +63,7 @@ def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
     yield "map", "Map", told + map_svg(record)
     yield "errors", "Errors", _errors(record)
     yield "journeys", "Journeys", _journeys(record)
+    yield "calibration", "Calibration", _calibration(record)
     yield "clusters", "Clusters", _clusters(record)
     yield "residuals", "Residuals", _residuals(record)
     yield "adjustment", "Bundle adjustment", _adjustment(record)
@@ -117,6 +119,19 @@ def _journeys(record: RunRecord) -> str:
         + drawing(plots.plot_bias(record.journeys))
         + bias_table(record.journeys)
         + warning
+    )
+
+
+def _calibration(record: RunRecord) -> str:
+    if not record.calibration:
+        return ""
+    told = note(
+        "What every car has wrong against its rig.yaml, found with the map. Near 0 the sigma over that of the prior says "
+        "that it was seen, near 1 that it is held where it was stated. calibration.json has all numbers, rigs/ has rig.yaml "
+        "files with what was found put right."
+    )
+    return (
+        told + drawing(plot_calibration(record.calibration)) + calibration_table(record.calibration)
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
+from crowdmap_torch.adjustment.found_calibration import FleetCalibration
 from crowdmap_torch.config import MapperConfig, dump
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.signs import SignComparison
@@ -55,6 +56,8 @@ class RunRecord:
     """Journeys set aside at the door."""
     outlier_journeys: tuple[RejectedJourney, ...] = ()
     """Journeys that lost their weight."""
+    calibration: FleetCalibration = field(default_factory=dict)
+    """What cars have wrong for good."""
     spectra: tuple[Eigengap, ...] = ()
     residual_px: Mapping[str, Float[Tensor, " n"]] = field(default_factory=dict)
     """Lengths of pixel residuals, by stage, in the order of the stages."""
@@ -107,6 +110,7 @@ def record_of(
         counts=counts_of(dataset, result, config),
         pruned=pruned_of(dataset, result, config),
         warnings=tuple(warnings),
+        calibration=result.uncertainty.calibration,
         rejected=dataset.rejected,
         outlier_journeys=outlier_journeys_of(dataset, result.first),
         spectra=eigengaps_of(result.first),

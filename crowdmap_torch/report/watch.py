@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import columns
 from crowdmap_torch.evaluation.evaluate import progress_scalars
 from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.optim.linearize import residuals
@@ -24,6 +25,8 @@ _LANES_EVERY = 5
 
 _MOST_CAMERAS = 4
 """Whose residuals are drawn: those that saw most."""
+_MOST_CARS = 12
+"""Whose calibration is followed."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,7 @@ class Watch:
         names = ("sign_px", "lane_px", "lane_correlation")
         scales = dict(zip(names, bundle.scale.tolist(), strict=True))
         self._log.log_scalars({f"scale/{k}": v for k, v in scales.items()}, number + 1)
+        self._log.log_scalars(dict(_calibration_scalars(bundle)), number + 1)
         if len(bundle.corners):
             given_up = bundle.given_up[bundle.corners.detection].double().mean()
             self._log.log_scalars({"robust/given_up": float(given_up)}, number + 1)
@@ -142,3 +146,15 @@ def corner_residuals(bundle: Bundle) -> Float[Tensor, "m 2"]:
     if term is None or not len(term):
         return torch.zeros(0, 2, dtype=bundle.scale.dtype)
     return (residuals(term, bundle.values()) * bundle.corner_sigma()[:, None]).cpu()
+
+
+def _calibration_scalars(bundle: Bundle) -> Iterator[tuple[str, float]]:
+    """Tag and value of every number of the first cars, in the configuration's units."""
+    values, fleet = bundle.values(), bundle.fleet
+    for variable in fleet.variables:
+        for name, at in columns(variable, fleet.config).items():
+            numbers = values[variable][:_MOST_CARS, at].detach() * getattr(fleet.config, name)
+            for car, row in zip(fleet.vehicles, numbers.tolist(), strict=False):
+                for k, value in enumerate(row):
+                    end = f"_{k}" if len(row) > 1 else ""
+                    yield f"calibration/{name}{end}/{car}", value

@@ -25,6 +25,7 @@ import torch
 
 from crowdmap_torch import __version__
 from crowdmap_torch.adjustment.adjust import Standing
+from crowdmap_torch.adjustment.calibration import KnownCalibration
 from crowdmap_torch.config import MapperConfig, as_dict
 from crowdmap_torch.io.atomic import drop_halves
 from crowdmap_torch.io.documents import read_json, write_json
@@ -197,6 +198,7 @@ def inputs_of(
     survey: Survey | None,
     truth: Truth | None,
     control: Survey | None,
+    known_cars: Mapping[str, KnownCalibration] | None = None,
     *,
     device: torch.device,
 ) -> dict[str, Any]:
@@ -205,6 +207,7 @@ def inputs_of(
     if truth is not None:
         known = [{f.name: getattr(t, f.name) for f in fields(t)[1:]} for t in truth.journeys]
     beside = {"survey": survey, "truth of the survey": known, "control": control}
+    beside["calibration"] = known_cars or None
     return {
         "crowdmap": __version__,
         "torch": torch.__version__,

@@ -26,12 +26,13 @@ from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import Truth, has_truth, read_associations, read_truth
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.processes.interrupts import held
+from crowdmap_torch.runs.calibration import write_found
 from crowdmap_torch.runs.lock import locked
 from crowdmap_torch.tables import Dataset, HdMap, Origin, Survey
 
 _MAKES = (
     *("map", "map_clusters", "journeys", "associations.parquet", "config.yaml"),
-    *("tensorboard", "metrics.json", "report.html"),
+    *("tensorboard", "metrics.json", "report.html", "calibration.json", "rigs"),
 )
 """What a result consists of."""
 _MAP_FILES = ("map.json", "signs.parquet", "tentative_signs.parquet", "lanes.parquet")
@@ -40,6 +41,7 @@ _MADE = (
     *(f"{name}/{file}" for name in ("map", "map_clusters") for file in _MAP_FILES),
     *(f"journeys/*/{name}.parquet" for name in ("poses", "signs", "lanes", "road")),
     "tensorboard/events.out.tfevents.*",
+    *("rigs/*/rig.yaml", "rigs/*/rig.urdf"),
 )
 """Every file of a result; what else is in its folders is somebody else's."""
 _NO_PLACE = {
@@ -156,6 +158,7 @@ class RunFolder:
             sign_id=result.hd_map.sign_id,
             lane_id=result.hd_map.lane_id,
         )
+        write_found(self.unfinished, dataset, result.uncertainty.calibration)
         with atomic_file(self.unfinished / "config.yaml") as beside:
             beside.write_text(dump(config), encoding="utf-8")
         for name, hd_map in (("map_clusters", result.map_clusters), ("map", result.hd_map)):

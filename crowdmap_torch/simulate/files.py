@@ -14,6 +14,7 @@ from jaxtyping import Float
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io import poses
 from crowdmap_torch.io.documents import plain, write_json
+from crowdmap_torch.io.rigs import rig_yaml
 from crowdmap_torch.io.writing import (
     list_column,
     name_column,
@@ -23,7 +24,7 @@ from crowdmap_torch.io.writing import (
 )
 from crowdmap_torch.simulate.fleet import Vehicle
 from crowdmap_torch.simulate.lane_perception import TYPES, LaneRows
-from crowdmap_torch.simulate.rigs import SimulatedRig, rig_yaml
+from crowdmap_torch.simulate.rigs import SimulatedRig
 from crowdmap_torch.simulate.sign_detections import SignRows, all_codes
 from crowdmap_torch.simulate.vehicle import Drive
 from crowdmap_torch.simulate.worlds import World
@@ -35,7 +36,11 @@ _CORNERS = polygon.CORNER_COUNT.numpy()
 def write_rig(folder: Path, rig: SimulatedRig) -> None:
     """`rig.yaml` and, for a rig with a mount, `rig.urdf`."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "rig.yaml").write_text(rig_yaml(rig), encoding="utf-8")
+    mount = None
+    if rig.pose_link is not None:
+        mount = ("rig.urdf", rig.pose_link, "camera_optical")
+    text = rig_yaml(rig.camera, rig.road_normal_camera, rig.camera_height, mount)
+    (folder / "rig.yaml").write_text(text, encoding="utf-8")
     if rig.urdf is not None:
         (folder / "rig.urdf").write_text(rig.urdf, encoding="utf-8")
 

@@ -87,35 +87,6 @@ def build_rig(config: RigConfig, index: int, rng: np.random.Generator) -> Simula
     )
 
 
-def rig_yaml(rig: SimulatedRig) -> str:
-    """The text of rig.yaml (FORMAT.md)."""
-    camera = rig.camera
-    K = camera.K.tolist()
-    normal = ", ".join(repr(float(x)) for x in rig.road_normal_camera)
-    lines = [
-        "camera:",
-        f"  model: {camera.model}",
-        f"  width: {camera.width}",
-        f"  height: {camera.height}",
-        f"  fx: {K[0][0]!r}",
-        f"  fy: {K[1][1]!r}",
-        f"  cx: {K[0][2]!r}",
-        f"  cy: {K[1][2]!r}",
-        f"  distortion: [{', '.join(repr(float(k)) for k in camera.distortion)}]",
-        "road:",
-        f"  normal: [{normal}]",
-        f"  height_m: {rig.camera_height!r}",
-    ]
-    if rig.urdf is not None:
-        lines += [
-            "mount:",
-            "  urdf: rig.urdf",
-            f"  pose_link: {rig.pose_link}",
-            "  camera_link: camera_optical",
-        ]
-    return "\n".join(lines) + "\n"
-
-
 def _camera(config: RigConfig, rng: np.random.Generator) -> Camera:
     focal = config.focal_px * rng.uniform(0.97, 1.03)
     spread = rng.uniform(0.9, 1.1, 4)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.simulate.errors import ALL, ERRORS, VEHICLES, with_errors
@@ -18,7 +19,10 @@ from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureMap, Task
 
-CALIBRATIONS: Mapping[str, MapperConfig] = {"off": OURS}
+CALIBRATIONS: Mapping[str, MapperConfig] = {
+    "off": replace(OURS, calibration=CalibrationConfig.off()),
+    "on": OURS,
+}
 """Configurations that are compared, by what the column `calibration` says of them; `off` is what others are held to."""
 NONE = "none"
 _FACTORS = (1.0, 2.0)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import camera, se3
 from crowdmap_torch.mapper import MapResult, build_bundle
@@ -18,7 +19,7 @@ from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import CostTerm, Problem
 from crowdmap_torch.tables import Dataset, Journey
 
-Build = Callable[[str], Bundle]
+Build = Callable[..., Bundle]
 
 
 LENS = torch.tensor([-0.25, 0.08, 4e-4, -3e-4], dtype=torch.float64)
@@ -44,10 +45,10 @@ def build(tiny: Dataset, tiny_result: MapResult) -> Build:
     journeys = (one, *(through_a_lens(journey) for journey in others))
     config = MapperConfig()
 
-    def built(jacobians: str) -> Bundle:
+    def built(jacobians: str, calibration: CalibrationConfig | None = None) -> Bundle:
         lm = replace(config.adjust.lm, max_iterations=3)
         own = replace(config.adjust, lm=lm, frame_spacing_m=6.0, jacobians=jacobians)
-        settings = replace(config, adjust=own)
+        settings = replace(config, adjust=own, calibration=calibration or config.calibration)
         return build_bundle(journeys, tiny_result.journey_maps, tiny_result.first, settings)
 
     return built
@@ -83,7 +84,7 @@ def exact_errors(bundle: Bundle, values: dict[str, Tensor]) -> Tensor:
 
 
 def test_the_gradient_is_that_of_the_exact_lens(build: Build) -> None:
-    bundle = build("closed")
+    bundle = build("closed", CalibrationConfig.off())
     assert {lens.is_linear for lens in bundle.lenses} == {False, True}
     state = adjust.start(bundle)
     for number, _ in adjust.steps(bundle, state):

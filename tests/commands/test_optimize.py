@@ -23,6 +23,7 @@ from crowdmap_torch.cli import main
 from crowdmap_torch.commands import optimize as optimize_command
 from crowdmap_torch.config import MapperConfig, load_config
 from crowdmap_torch.io.maps import read_map
+from crowdmap_torch.io.rigs import read_rig
 from crowdmap_torch.tables import Dataset
 
 LANDMARK = {"n_journeys", "n_observations", "first_seen_ns", "last_seen_ns", "confidence"}
@@ -346,6 +347,57 @@ def test_control_points_pin_the_map_and_are_left_out_of_its_figures(
     assert metrics["counts"]["control points"] > 0
     assert metrics["survey"]["control_signs"] >= metrics["counts"]["control points"]
     assert metrics["survey"]["signs"]["matched_observable"] == 0
+
+
+def test_a_run_says_what_its_cars_have_wrong(run: Path, tiny: Dataset):
+    found = json.loads((run / "calibration.json").read_text())
+    assert found["format"] == "crowdmap-calibration" and found["version"] == 1
+    assert found["cars"].keys() == {journey.vehicle for journey in tiny.journeys}
+    for name, car in found["cars"].items():
+        assert car["journeys"] == sum(journey.vehicle == name for journey in tiny.journeys)
+        for one in car["parameters"].values():
+            # Nothing is less sure than before.
+            assert all(
+                0 < s <= 1.001 * p for s, p in zip(one["sigma"], one["prior_sigma"], strict=True)
+            )
+        rig = read_rig(run / "rigs" / name)
+        stated = next(j.rig for j in tiny.journeys if j.vehicle == name)
+        share = 1 + car["parameters"]["focal"]["estimate"][0]
+        torch.testing.assert_close(rig.camera.K[0, 0], stated.camera.K[0, 0] * share)
+    report = (run / "report.html").read_text()
+    assert 'id="calibration"' in report and "truth minus rig.yaml" in report
+    board = EventAccumulator(str(run / "tensorboard"))
+    board.Reload()
+    assert any(tag.startswith("calibration/mount_deg_0/") for tag in board.Tags()["scalars"])
+
+
+def test_what_a_run_found_of_cars_is_begun_with(
+    optimize, run: Path, tiny_folder: Path, tmp_path: Path, quick: None
+):
+    said = optimize(tiny_folder, tmp_path / "again", "--calibration", str(run))
+    assert said.code == 0 and "nothing is known" not in said.err
+    before, after = (
+        json.loads((folder / "calibration.json").read_text())["cars"]
+        for folder in (run, tmp_path / "again")
+    )
+    for name, car in after.items():
+        for key, one in car["parameters"].items():
+            known = before[name]["parameters"][key]
+            assert one["prior_sigma"] == pytest.approx(known["sigma"], rel=1e-9)
+
+
+def test_calibration_off_leaves_rigs_as_they_are(
+    optimize, tiny_folder: Path, tmp_path: Path, quick: None
+):
+    assert optimize(tiny_folder, tmp_path / "run", "--calibration", "off").code == 0
+    assert not (tmp_path / "run" / "calibration.json").exists()
+    assert not (tmp_path / "run" / "rigs").exists()
+
+
+def test_a_calibration_that_is_not_there_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):
+    said = optimize(tiny_folder, tmp_path / "run", "--calibration", str(tmp_path / "nowhere"))
+    assert said.code == 2 and said.err.count("\n") == 1
+    assert "calibration.json" in said.err and not (tmp_path / "run").exists()
 
 
 def test_control_points_of_another_place_are_one_line(optimize, copy: Path, tmp_path: Path):

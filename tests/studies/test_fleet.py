@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from worlds.studied import errors, figures, fill, measured, rows, work
 
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
+from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.simulate.errors import ERRORS
 from crowdmap_torch.studies import fleet
 from crowdmap_torch.studies.folder import StudyFolder
@@ -48,8 +50,12 @@ def test_variants_differ_in_their_errors_and_nothing_else():
 def test_drives_without_errors_are_those_of_other_studies():
     scale = ONE_SEED.scale
     whole = [t for t in work(fleet, ONE_SEED) if t.count == scale.journeys]
-    assert whole[0].simulation == scale.drives(0)
-    assert whole[1].simulation.fleet.vehicles == 8
+    right, spoilt = whole[: len(fleet.CALIBRATIONS)], whole[len(fleet.CALIBRATIONS) :]
+    assert all(task.simulation == scale.drives(0) for task in right)
+    assert all(task.simulation.fleet.vehicles == 8 for task in spoilt)
+    for tasks in (right, spoilt):
+        off, on = (task.config.calibration for task in tasks)
+        assert off == CalibrationConfig.off() and on == MapperConfig().calibration
 
 
 def test_errors_are_told_beside_the_drives_without_them(folder: StudyFolder):
@@ -86,6 +92,7 @@ def test_coverage_counts_every_sign_once(tmp_path: Path):
 def test_a_second_configuration_has_rows_and_work_of_its_own(
     folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(fleet, "CALIBRATIONS", {"off": fleet.OURS})
     before = len(work(fleet, ONE_SEED))
     other = replace(fleet.OURS, min_confidence=0.4)
     monkeypatch.setattr(fleet, "CALIBRATIONS", {"off": fleet.OURS, "on": other})

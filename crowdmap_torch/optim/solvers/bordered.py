@@ -203,9 +203,10 @@ class BorderedCovariance(LandmarkCovariance):
     _reduced: Reduced
     _factor: Factor
 
-    def of_border(self, name: str) -> Float[Tensor, "n b b"]:
-        """Covariance of every block of a variable of the border."""
-        entry = self._equations.layout.entries(name, slice(None))
+    def of_border(self, *names: str) -> Float[Tensor, "n b b"]:
+        """Joint covariance of the blocks that variables of the border have of each number, one behind the other."""
+        layout = self._equations.layout
+        entry = torch.cat([layout.entries(name, slice(None)) for name in names], dim=1)
         return self._border[entry[:, :, None], entry[:, None]]
 
     def of_chain_sums(self, weight: Float[Tensor, "n k m"]) -> Float[Tensor, "j m m"]:

@@ -346,9 +346,9 @@ class SampledCovariance:
         value = self._values(functions).mean(0)
         return value @ value.mT / value.shape[-1]
 
-    def of_border(self, name: str) -> Float[Tensor, "n b b"]:
-        """Covariance of every block of a variable of the border."""
-        drawn = self.drawn[name]
+    def of_border(self, *names: str) -> Float[Tensor, "n b b"]:
+        """Joint covariance of the blocks that variables of the border have of each number, one behind the other."""
+        drawn = torch.cat([self.drawn[name] for name in names], dim=1)
         return drawn @ drawn.mT / drawn.shape[-1]
 
     def of_chain_sums(self, weight: Float[Tensor, "n k m"]) -> Float[Tensor, "j m m"]:

@@ -115,8 +115,8 @@ class MapCovariance(Covariance, Protocol):
         """
         ...
 
-    def of_border(self, name: str) -> Float[Tensor, "n b b"]:
-        """Covariance of every block of a variable that drives have to themselves or share."""
+    def of_border(self, *names: str) -> Float[Tensor, "n b b"]:
+        """Covariance of every block of what drives have to themselves or share, of several such variables jointly."""
         ...
 
     def of_chain_sums(self, weight: Float[Tensor, "n k m"]) -> Float[Tensor, "j m m"]:

@@ -1,0 +1,335 @@
+"""What each car has wrong for good: its mount, its camera, its clock, its detector; unknowns that its journeys share.
+
+To first order every one of them adds a linear part to residuals that are there already. Mount and clock move the pose that
+the positioning module's word is compared with; the others move what the image shows, or the road under it:
+
+    pose       += [R_world_camera place + clock v; turn + clock omega]
+    pixel      += focal (u - c) + principal + read_out (row / height - 1/2) du/dt + box (u - u_sign) + corner
+    lane point += du/dleft lane        height of the road under the camera += height
+
+with the derivatives taken where the unknowns are by now, as with lenses (`lenses`): residuals are those of the true camera.
+What is left out is how the calibration changes the derivatives by poses and landmarks: some thousandths of them. Unknowns
+are in units of their prior sigmas. A car is a `vehicle_id`, or else a rig.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.ranges import Degrees, LengthOrNone, PixelsOrNone, Settings, Share
+from crowdmap_torch.residuals.calibration import with_linear_part
+from crowdmap_torch.residuals.pose import gauss_markov_start
+from crowdmap_torch.residuals.reprojection import pixel_error_jacobian
+from crowdmap_torch.tables import Journey
+
+KnownCalibration = Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
+"""Of one car: estimates and sigmas of a parameter's numbers, in the configuration's units."""
+_SUREST = 1e-3
+"""Least share of the configuration's sigma that what was found before counts with."""
+_HALF_WINDOW_S = 0.2
+"""Velocities are differences over about twice this: over single frames the poses' own noise would be most of them."""
+
+
+@dataclass(frozen=True)
+class CalibrationConfig(Settings):
+    """How far cars may be from their rig.yaml, 1-sigma; what has 0 is known."""
+
+    mount_deg: Degrees = 0.2
+    """Turn of the camera about each of its axes against the stated mount."""
+    mount_m: LengthOrNone = 0.0
+    """Place of the camera against the stated mount, along its axes."""
+    clock_s: Share = 0.015
+    """Time by which pictures are taken later than they and their poses are stamped."""
+    focal: Share = 0.002
+    """Share by which the focal length is larger than stated."""
+    principal_px: PixelsOrNone = 1.5
+    """Principal point against the stated one, in u and in v."""
+    read_out_s: Share = 0.02
+    """Rolling shutter: time from the first row of the image to the last."""
+    box: Share = 0.01
+    """Share by which the outline of detected signs is too large."""
+    corner_px: PixelsOrNone = 0.0
+    """Shift of detected corners in u and in v."""
+    lane_m: LengthOrNone = 0.03
+    """How far to the left of a marker's middle, as the driver sees it, its points are detected."""
+    height_m: LengthOrNone = 0.03
+    """Height of the camera above the road against the stated one."""
+
+    @classmethod
+    def off(cls) -> CalibrationConfig:
+        """Everything is known."""
+        return cls(**{f.name: 0.0 for f in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One kind of what a car has wrong."""
+
+    name: str
+    """Of the configuration's sigma."""
+    count: int
+    """How many numbers it is."""
+    unit: float = 1.0
+    """Of the configuration's number, in those of this package."""
+
+
+MOUNT = (Parameter("mount_deg", 3, math.pi / 180), Parameter("mount_m", 3), Parameter("clock_s", 1))
+"""What moves the pose."""
+OPTICS = (
+    Parameter("focal", 1),
+    Parameter("principal_px", 2),
+    Parameter("read_out_s", 1),
+    Parameter("box", 1),
+    Parameter("corner_px", 2),
+    Parameter("lane_m", 1),
+    Parameter("height_m", 1),
+)
+"""What moves the image, and the road under it."""
+VARIABLES = {"mount": MOUNT, "optics": OPTICS}
+"""The unknowns of every car, by variable of the bundle."""
+
+
+def columns(variable: str, config: CalibrationConfig) -> dict[str, slice]:
+    """Where in its variable every parameter is that is not known."""
+    found, first = {}, 0
+    for one in VARIABLES[variable]:
+        if getattr(config, one.name) > 0:
+            found[one.name] = slice(first, first + one.count)
+            first += one.count
+    return found
+
+
+def width(variable: str, config: CalibrationConfig) -> int:
+    """How many numbers of a car are unknown."""
+    return max((at.stop for at in columns(variable, config).values()), default=0)
+
+
+@dataclass(frozen=True)
+class ByOptics:
+    """Derivatives of rows by the optics of their cars, in units of the configuration's sigmas."""
+
+    image: Float[Tensor, "m 2 k"]
+    """Of the pixel."""
+    height: Float[Tensor, "m _ k"]
+    """Of a lane point's height over the road; nothing for corners."""
+
+    @classmethod
+    def none(cls, count: int, config: CalibrationConfig, like: Tensor, heights: int) -> ByOptics:
+        """Those of rows of which nothing is known yet."""
+        k = width("optics", config)
+        return cls(like.new_zeros(count, 2, k), like.new_zeros(count, heights, k))
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """The cars, and what of their journeys the derivatives by their calibration need."""
+
+    vehicles: tuple[str, ...]
+    of_journey: Int[Tensor, " j"]
+    """Car of each journey."""
+    of_pose: Int[Tensor, " p"]
+    """Car of each pose of the bundle."""
+    given: Float[Tensor, "p 4 4"]
+    """The positioning module's poses."""
+    velocity: Float[Tensor, "p 3"]
+    """Of the camera, along the world's axes [m/s]."""
+    turning: Float[Tensor, "p 3"]
+    """Of the camera, about its own axes [rad/s]."""
+    expected: dict[str, Float[Tensor, "v _"]]
+    """What is known of every car before, by variable: zero, or what was found earlier."""
+    prior_sigma: dict[str, Float[Tensor, "v _"]]
+    """1-sigma of that."""
+    config: CalibrationConfig
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Those of which anything is unknown."""
+        return tuple(self.expected)
+
+    def priors(self) -> dict[str, CostTerm]:
+        """Calibrations are about as stated, or as found before."""
+        every = torch.arange(len(self.vehicles), device=self.given.device)
+        return {
+            f"{name}_prior": CostTerm(
+                gauss_markov_start,
+                ((name, every),),
+                (self.expected[name],),
+                1 / self.prior_sigma[name],
+                takes_rows=True,
+            )
+            for name in self.variables
+        }
+
+    def of_poses(self, term: CostTerm) -> CostTerm:
+        """`pose_white`, of the pose that a true mount and clock would have given."""
+        if "mount" not in self.variables:
+            return term
+        return with_linear_part(term, "mount", self.of_pose, -self._by_mount())
+
+    def of_corners(self, term: CostTerm, rows: CornerObservations, by: ByOptics) -> CostTerm:
+        """`sign_reprojection` by the true camera; `by` are `by_optics` of the corners."""
+        if "optics" not in self.variables:
+            return term
+        return with_linear_part(term, "optics", self.of_pose[rows.frame], by.image)
+
+    def of_lane_points(
+        self,
+        terms: dict[str, CostTerm],
+        rows: LanePointObservations,
+        normal_px: Float[Tensor, "m 2"],
+        by: ByOptics,
+    ) -> dict[str, CostTerm]:
+        """`lane_reprojection` by the true camera, and `lane_height` at its true height over the road."""
+        if "optics" not in self.variables:
+            return terms
+        car = self.of_pose[rows.frame]
+        across = (normal_px[:, :, None] * by.image).sum(1, keepdim=True)
+        image, ground = terms["lane_reprojection"], terms["lane_height"]
+        return {
+            "lane_reprojection": with_linear_part(image, "optics", car, across),
+            "lane_height": with_linear_part(ground, "optics", car, by.height),
+        }
+
+    def _by_mount(self) -> Float[Tensor, "p 6 k"]:
+        """Derivatives of what the poses given are wrong by, as tangents of geometry.se3."""
+        config, at = self.config, columns("mount", self.config)
+        by = self.given.new_zeros(len(self.given), 6, width("mount", config))
+        if "mount_deg" in at:
+            eye = torch.eye(3).to(by)
+            by[:, 3:, at["mount_deg"]] = eye * math.radians(config.mount_deg)
+        if "mount_m" in at:
+            by[:, :3, at["mount_m"]] = self.given[:, :3, :3] * config.mount_m
+        if "clock_s" in at:
+            moved = torch.cat((self.velocity, self.turning), dim=-1)
+            by[:, :, at["clock_s"]] = moved[..., None] * config.clock_s
+        return by
+
+    def by_optics(
+        self,
+        rows: CornerObservations | LanePointObservations,
+        lenses: Sequence[Camera],
+        point_camera: Float[Tensor, "m 3"],
+        pose: Float[Tensor, "p 4 4"],
+    ) -> ByOptics:
+        """Derivatives by the optics of the rows' cars of where points `point_camera` are seen, and above the road."""
+        config, at = self.config, columns("optics", self.config)
+        by = point_camera.new_zeros(len(rows), 2, width("optics", config))
+        error, by_point = pixel_error_jacobian(point_camera.mT, rows.matrix.permute(1, 2, 0))
+        seen, by_point = rows.px + error.mT, by_point.permute(2, 0, 1)
+        middle = torch.stack([lens.K[:2, 2] for lens in lenses])[rows.lens]
+        tall = seen.new_tensor([float(lens.height) for lens in lenses])[rows.lens]
+        of_corners = isinstance(rows, CornerObservations)
+        if "focal" in at:
+            by[..., at["focal"]] = (seen - middle)[..., None] * config.focal
+        if "principal_px" in at:
+            by[..., at["principal_px"]] = torch.eye(2).to(by) * config.principal_px
+        if "read_out_s" in at:
+            to_camera = pose[rows.frame, :3, :3].mT
+            moves = -(to_camera @ self.velocity[rows.frame, :, None])[..., 0]
+            moves = moves - torch.linalg.cross(self.turning[rows.frame], point_camera)
+            share = (seen[:, 1] / tall - 0.5) * config.read_out_s
+            by[..., at["read_out_s"]] = (by_point @ moves[..., None]) * share[:, None, None]
+        if "box" in at and of_corners:
+            by[..., at["box"]] = (seen - _means(seen, rows.detection))[..., None] * config.box
+        if "corner_px" in at and of_corners:
+            by[..., at["corner_px"]] = torch.eye(2).to(by) * config.corner_px
+        if "lane_m" in at and not of_corners:
+            ahead = torch.zeros_like(point_camera)
+            ahead[:, 2] = 1
+            left = torch.linalg.cross(-rows.normal_camera, ahead)
+            left = torch.nn.functional.normalize(left, dim=-1)
+            by[..., at["lane_m"]] = (by_point @ left[..., None]) * config.lane_m
+        height = by.new_zeros(len(rows), 0 if of_corners else 1, by.shape[-1])
+        if not of_corners:
+            self._tilt_road(height, rows, lenses, point_camera)
+        return ByOptics(by, height)
+
+    def _tilt_road(
+        self,
+        height: Float[Tensor, "m 1 k"],
+        rows: LanePointObservations,
+        lenses: Sequence[Camera],
+        point_camera: Float[Tensor, "m 3"],
+    ) -> None:
+        """Derivatives of the height of lane points over the road plane under the camera, into `height`.
+
+        The plane's normal n was read off the image, by the stated camera: its horizon stays where it is in the image.
+        """
+        config, at = self.config, columns("optics", self.config)
+        n, (x, y, z) = rows.normal_camera, point_camera.unbind(-1)
+        above = (n * point_camera).sum(-1)
+        flat = n[:, 0].square() + n[:, 1].square()
+        if "focal" in at:
+            grown = n[:, 0] * x + n[:, 1] * y - above * flat
+            height[:, 0, at["focal"]] = grown[:, None] * config.focal
+        if "principal_px" in at:
+            focal = torch.stack([lens.K.diagonal()[:2] for lens in lenses])[rows.lens]
+            sunk = (z - above * n[:, 2])[:, None]
+            height[:, 0, at["principal_px"]] = n[:, :2] / focal * sunk * config.principal_px
+        if "height_m" in at:
+            height[:, 0, at["height_m"]] = -config.height_m
+
+
+def fleet_of(
+    journeys: Sequence[Journey],
+    frame: Int[Tensor, " p"],
+    journey: Int[Tensor, " p"],
+    config: CalibrationConfig,
+    known: Mapping[str, KnownCalibration],
+) -> Fleet:
+    """The cars of some journeys, and what is `known` of some of them.
+
+    `frame` and `journey` are those of the poses of the bundle, frames counted over all.
+    """
+    vehicles = tuple(dict.fromkeys(one.vehicle for one in journeys))
+    number = {name: k for k, name in enumerate(vehicles)}
+    of_journey = torch.tensor([number[one.vehicle] for one in journeys], device=frame.device)
+    velocity, turning = (
+        torch.cat(part)[frame] for part in zip(*(_motion(one) for one in journeys), strict=True)
+    )
+    given = torch.cat([one.T_world_camera for one in journeys])[frame]
+    expected, sigma = {}, {}
+    for variable in VARIABLES:
+        if count := width(variable, config):
+            expected[variable] = given.new_zeros(len(vehicles), count)
+            sigma[variable] = torch.ones_like(expected[variable])
+            for name, at in columns(variable, config).items():
+                for car in vehicles:
+                    if found := known.get(car, {}).get(name):
+                        of_number = given.new_tensor(found) / getattr(config, name)
+                        expected[variable][number[car], at] = of_number[0]
+                        # What was found is not surer than before because it is asked for again.
+                        sigma[variable][number[car], at] = of_number[1].clamp(_SUREST, 1.0)
+    cars = of_journey[journey]
+    return Fleet(vehicles, of_journey, cars, given, velocity, turning, expected, sigma, config)
+
+
+def _motion(journey: Journey) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
+    """Velocity along the world's axes and turning about the camera's, of every frame."""
+    T, t_s = (
+        journey.T_world_camera,
+        (journey.t_ns - journey.t_ns[0]).to(journey.T_world_camera) * 1e-9,
+    )
+    low = torch.searchsorted(t_s, t_s - _HALF_WINDOW_S).clamp_max(len(t_s) - 1)
+    high = (torch.searchsorted(t_s, t_s + _HALF_WINDOW_S, right=True) - 1).clamp_min(0)
+    step = (t_s[high] - t_s[low]).clamp_min(1e-3)[:, None]
+    turned = T[low, :3, :3].mT @ T[high, :3, :3]
+    return (T[high, :3, 3] - T[low, :3, 3]) / step, se3.so3_log(turned) / step
+
+
+def _means(value: Float[Tensor, "m 2"], group: Int[Tensor, " m"]) -> Float[Tensor, "m 2"]:
+    """The mean of each row's group."""
+    _, of = torch.unique(group, return_inverse=True)
+    count = torch.bincount(of)
+    total = value.new_zeros(len(count), 2).index_add_(0, of, value)
+    return (total / count[:, None])[of]

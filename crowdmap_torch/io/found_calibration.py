@@ -1,0 +1,120 @@
+"""What an adjustment found of cars' calibrations, on disk: `calibration.json`, and rigs ready to be used (FORMAT.md)."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.io.atomic import atomic_file
+from crowdmap_torch.io.documents import Document, read_json, write_json
+from crowdmap_torch.io.rigs import rig_yaml
+from crowdmap_torch.tables import Rig
+
+FORMAT = "crowdmap-calibration"
+Numbers = Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
+"""Of one car: estimates and sigmas of every parameter."""
+_URDF = """<?xml version="1.0"?>
+<robot name="rig">
+  <link name="base_link"/>
+  <link name="camera_optical"/>
+  <joint name="mount" type="fixed">
+    <parent link="base_link"/>
+    <child link="camera_optical"/>
+    <origin xyz="{} {} {}" rpy="{} {} {}"/>
+  </joint>
+</robot>
+"""
+
+
+def write_calibration(path: Path, cars: Mapping[str, Mapping[str, object]]) -> None:
+    """calibration.json: what was found of every car, by name."""
+    write_json(path, {"format": FORMAT, "version": 1, "cars": dict(cars)})
+
+
+def read_calibration(path: Path) -> dict[str, Numbers]:
+    """Estimates and sigmas of every car of a calibration.json; InputError for what breaks FORMAT.md."""
+    document = read_json(path)
+    document.require_format(FORMAT)
+    cars = document.part("cars")
+    return {name: _numbers(cars.part(name)) for name in cars.content}
+
+
+def _numbers(car: Document) -> Numbers:
+    parameters = car.part("parameters")
+    found = {}
+    for name in parameters.content:
+        one = parameters.part(name)
+        estimate = one.numbers("estimate", most=1e6)
+        sigma = one.numbers("sigma", len(estimate), most=1e6)
+        if min(sigma, default=1.0) <= 0:
+            raise one.fault("expected numbers above 0", "sigma")
+        found[name] = (tuple(estimate), tuple(sigma))
+    return found
+
+
+def corrected_rig(rig: Rig, numbers: Numbers) -> Rig:
+    """The rig with what was found put right: focal length, principal point, mount and height above the road."""
+
+    def found(name: str, count: int) -> torch.Tensor:
+        values = numbers[name][0] if name in numbers else (0.0,) * count
+        return torch.tensor(values, dtype=torch.float64, device=rig.T_link_camera.device)
+
+    K = rig.camera.K.clone()
+    K[[0, 1], [0, 1]] *= 1 + found("focal", 1)
+    K[:2, 2] += found("principal_px", 2)
+    T = torch.eye(4).to(rig.T_link_camera)
+    T[:3, :3] = se3.so3_exp(torch.deg2rad(found("mount_deg", 3)))
+    T[:3, 3] = found("mount_m", 3)
+    return replace(
+        rig,
+        camera=replace(rig.camera, K=K),
+        T_link_camera=rig.T_link_camera @ T,
+        road_normal_camera=T[:3, :3].mT @ rig.road_normal_camera,
+        camera_height=rig.camera_height + float(found("height_m", 1)),
+    )
+
+
+def write_corrected_rigs(folder: Path, rigs: Sequence[tuple[str, Rig]]) -> None:
+    """A folder for each car, by name: rig.yaml, and the mount in rig.urdf."""
+    for name, rig in rigs:
+        place = folder / folder_name(name)
+        place.mkdir(parents=True, exist_ok=True)
+        x, y, z = rig.T_link_camera[:3, 3].tolist()
+        numbers = (x, y, z, *_roll_pitch_yaw(rig.T_link_camera[:3, :3]))
+        for file, text in (
+            ("rig.urdf", _URDF.format(*(repr(number) for number in numbers))),
+            (
+                "rig.yaml",
+                rig_yaml(
+                    rig.camera,
+                    rig.road_normal_camera.tolist(),
+                    rig.camera_height,
+                    ("rig.urdf", "base_link", "camera_optical"),
+                ),
+            ),
+        ):
+            with atomic_file(place / file) as beside:
+                beside.write_text(text, encoding="utf-8")
+
+
+def folder_name(car: str) -> str:
+    """A car's name as that of a folder: what a file system may refuse is replaced, and told apart by a number."""
+    plain = re.sub(r"[^A-Za-z0-9._-]", "_", car)[:80].lstrip(".")
+    if plain == car and car:
+        return car
+    return f"{plain or 'car'}-{hashlib.sha256(car.encode()).hexdigest()[:8]}"
+
+
+def _roll_pitch_yaw(R: torch.Tensor) -> tuple[float, float, float]:
+    """URDF's angles of `Rz(yaw) Ry(pitch) Rx(roll)` [rad]."""
+    pitch = torch.asin(-R[2, 0].clamp(-1, 1))
+    if bool(R[2, 0].abs() > 1 - 1e-12):
+        # Straight up or down roll and yaw turn about one axis.
+        return 0.0, float(pitch), float(torch.atan2(-R[0, 1], R[1, 1]))
+    return float(torch.atan2(R[2, 1], R[2, 2])), float(pitch), float(torch.atan2(R[1, 0], R[0, 0]))

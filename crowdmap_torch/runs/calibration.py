@@ -1,0 +1,64 @@
+"""What a run found of its cars: calibration.json and rigs/ of FORMAT.md, and what an earlier run found."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+
+from crowdmap_torch.adjustment.calibration import KnownCalibration
+from crowdmap_torch.adjustment.found_calibration import FleetCalibration
+from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.found_calibration import (
+    corrected_rig,
+    read_calibration,
+    write_calibration,
+    write_corrected_rigs,
+)
+from crowdmap_torch.tables import Dataset
+
+_FILE = "calibration.json"
+
+
+def write_found(folder: Path, dataset: Dataset, found: FleetCalibration) -> None:
+    """calibration.json, and for every car its rig put right; nothing where calibrations were not asked."""
+    if not found:
+        return
+    journeys = Counter(journey.vehicle for journey in dataset.journeys)
+    rig_of = {journey.vehicle: journey.rig for journey in reversed(dataset.journeys)}
+    cars = {}
+    for name, car in found.items():
+        parts = asdict(car)
+        parameters = {
+            key: {
+                **{part: list(parts[part][key]) for part in ("estimate", "sigma", "prior_sigma")},
+                "observability": [1 - ratio for ratio in car.ratio(key)],
+            }
+            for key in car.estimate
+        }
+        cars[name] = {
+            "rig": rig_of[name].rig_id,
+            "journeys": journeys[name],
+            "parameters": parameters,
+            "unseen": list(car.unseen),
+            "confounded": [list(pair) for pair in car.confounded],
+        }
+    write_calibration(folder / _FILE, cars)
+    rigs = [
+        (
+            name,
+            corrected_rig(rig_of[name], {k: (car.estimate[k], car.sigma[k]) for k in car.estimate}),
+        )
+        for name, car in found.items()
+    ]
+    write_corrected_rigs(folder / "rigs", rigs)
+
+
+def read_found(run: Path) -> dict[str, KnownCalibration]:
+    """What the run in a folder found of its cars; InputError where there is no such run, or it asked for no calibration."""
+    path = run / _FILE
+    if not path.exists():
+        raise InputError(
+            f"--calibration {run}: expected a run with {_FILE} in it, or off; none is there"
+        )
+    return dict(read_calibration(path))
