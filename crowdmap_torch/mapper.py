@@ -16,7 +16,6 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
-from crowdmap_torch.adjustment.calibration import KnownCalibration
 from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
 from crowdmap_torch.adjustment.lane_matching import detection_lanes
 from crowdmap_torch.config import MapperConfig, config_hash
@@ -36,6 +35,7 @@ from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.maps import as_map
 from crowdmap_torch.lanes.reconstruct import LaneReport, reconstruct_lanes
+from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.processes.workers import Workers

@@ -18,7 +18,9 @@ from torch import Tensor
 
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import camera
+from crowdmap_torch.geometry.trajectory import motion
 from crowdmap_torch.lanes.reconstruct import reconstruct_lanes
+from crowdmap_torch.noise.calibration import KnownCalibration, corrected_journey, corrected_rig
 from crowdmap_torch.road.estimate import RoadTracker
 from crowdmap_torch.signs.triangulate import triangulate_signs
 from crowdmap_torch.tables import (
@@ -40,6 +42,8 @@ SIGN_STRETCH_FRAMES = 75
 """Signs that went out of sight are mapped every so many frames: together they say more of the poses' drift."""
 LANE_STRETCH_FRAMES = 150
 """Lane tracklets do not end where a marker goes on: what they showed is mapped every so many frames."""
+_MOMENTS_NS = 400_000_000
+"""Poses of so long tell how a car moves."""
 MAPPING_FRAMES = 30
 """What was mapped comes out so many frames after its stretch ended: the mapping has that long to be done."""
 
@@ -88,13 +92,21 @@ class SingleJourneyMapper:
     sight, lane pieces every stretch. `state_dict` and `load_state_dict` interrupt a drive and go on.
     """
 
-    def __init__(self, rig: Rig, config: MapperConfig | None = None) -> None:
-        """Of a car with this rig; `config.road.method` is `causal` whatever the configuration smooths."""
+    def __init__(
+        self, rig: Rig, config: MapperConfig | None = None, known: KnownCalibration | None = None
+    ) -> None:
+        """Of a car with this rig, of whose calibration something may be `known` from a crowd (`calibration.json`).
+
+        `config.road.method` is `causal` whatever the configuration smooths.
+        """
         config = (config or MapperConfig()).resolved()
         if config.road.method == "smoothed":
             config = replace(config, road=replace(config.road, method="causal"))
         self.config = config
-        self.rig = rig
+        self.known = known or {}
+        self.rig = rig = corrected_rig(rig, self.known)
+        self._given: list[tuple[Tensor, Tensor]] = []
+        """Time and pose, as they came, of the frames of the last moments."""
         self._signs = SignAssociator(config.positioning, config.sign_association)
         self._lanes = LaneAssociator(config.lane_association)
         self._road = RoadTracker(rig, config.positioning, config.road)
@@ -115,6 +127,7 @@ class SingleJourneyMapper:
         """What a frame tells: a journey of one frame, as `frame_of` cuts it."""
         if frame.frame_count != 1:
             raise ValueError(f"expected a journey of one frame, found {frame.frame_count} frames")
+        frame = self._corrected(frame)
         pose, number = frame.T_world_camera[0], self._next
         self._next += 1
         sign_label, sign_shift = self._signs.step(number, pose, frame.signs)
@@ -147,6 +160,7 @@ class SingleJourneyMapper:
             "lanes": self._lanes.state_dict(),
             "road": copy.deepcopy(self._road),
             "next": self._next,
+            "given": list(self._given),
             "held": list(self._held),
             "mapped_lanes": self._mapped_lanes,
             "promised": [(p.due, p.result()) for p in self._promised],
@@ -158,9 +172,21 @@ class SingleJourneyMapper:
         self._lanes.load_state_dict(state["lanes"])
         self._road = copy.deepcopy(state["road"])
         self._next = state["next"]
+        self._given = list(state["given"])
         self._held = list(state["held"])
         self._mapped_lanes = state["mapped_lanes"]
         self._promised = [_Promise(due, lambda made=made: made) for due, made in state["promised"]]
+
+    def _corrected(self, frame: Journey) -> Journey:
+        """The frame with what is known of the car put right."""
+        if not self.known:
+            return frame
+        self._given.append((frame.t_ns, frame.T_world_camera))
+        begins = int(frame.t_ns) - _MOMENTS_NS
+        self._given = [(t_ns, T) for t_ns, T in self._given if int(t_ns) >= begins]
+        t_ns, T = (torch.cat(part) for part in zip(*self._given, strict=True))
+        velocity, turning = motion(T, t_ns)
+        return corrected_journey(frame, self.known, (velocity[-1:], turning[-1:]))
 
     def _held_signs(self) -> Int[Tensor, " n"]:
         """Tracklets of signs that were not mapped yet."""

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from crowdmap_torch.adjustment.bundle import Bundle
-from crowdmap_torch.adjustment.calibration import CalibrationConfig, KnownCalibration, fleet_of
+from crowdmap_torch.adjustment.calibration import CalibrationConfig, fleet_of
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes, supported_lanes
@@ -34,6 +34,7 @@ from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
 from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.geometry.trajectory import station
+from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.noise.pose_prior import DriftNodes, drift_nodes, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm

@@ -23,8 +23,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
-from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.geometry.trajectory import motion
+from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.ranges import Degrees, LengthOrNone, PixelsOrNone, Settings, Share
 from crowdmap_torch.residuals.calibration import with_linear_part
@@ -32,12 +33,8 @@ from crowdmap_torch.residuals.pose import gauss_markov_start
 from crowdmap_torch.residuals.reprojection import pixel_error_jacobian
 from crowdmap_torch.tables import Journey
 
-KnownCalibration = Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
-"""Of one car: estimates and sigmas of a parameter's numbers, in the configuration's units."""
 _SUREST = 1e-3
 """Least share of the configuration's sigma that what was found before counts with."""
-_HALF_WINDOW_S = 0.2
-"""Velocities are differences over about twice this: over single frames the poses' own noise would be most of them."""
 
 
 @dataclass(frozen=True)
@@ -295,7 +292,8 @@ def fleet_of(
     number = {name: k for k, name in enumerate(vehicles)}
     of_journey = torch.tensor([number[one.vehicle] for one in journeys], device=frame.device)
     velocity, turning = (
-        torch.cat(part)[frame] for part in zip(*(_motion(one) for one in journeys), strict=True)
+        torch.cat(part)[frame]
+        for part in zip(*(motion(one.T_world_camera, one.t_ns) for one in journeys), strict=True)
     )
     given = torch.cat([one.T_world_camera for one in journeys])[frame]
     expected, sigma = {}, {}
@@ -312,19 +310,6 @@ def fleet_of(
                         sigma[variable][number[car], at] = of_number[1].clamp(_SUREST, 1.0)
     cars = of_journey[journey]
     return Fleet(vehicles, of_journey, cars, given, velocity, turning, expected, sigma, config)
-
-
-def _motion(journey: Journey) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-    """Velocity along the world's axes and turning about the camera's, of every frame."""
-    T, t_s = (
-        journey.T_world_camera,
-        (journey.t_ns - journey.t_ns[0]).to(journey.T_world_camera) * 1e-9,
-    )
-    low = torch.searchsorted(t_s, t_s - _HALF_WINDOW_S).clamp_max(len(t_s) - 1)
-    high = (torch.searchsorted(t_s, t_s + _HALF_WINDOW_S, right=True) - 1).clamp_min(0)
-    step = (t_s[high] - t_s[low]).clamp_min(1e-3)[:, None]
-    turned = T[low, :3, :3].mT @ T[high, :3, :3]
-    return (T[high, :3, 3] - T[low, :3, 3]) / step, se3.so3_log(turned) / step
 
 
 def _means(value: Float[Tensor, "m 2"], group: Int[Tensor, " m"]) -> Float[Tensor, "m 2"]:

@@ -23,7 +23,7 @@ import torch
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.adjustment.calibration import CalibrationConfig, KnownCalibration
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.config import MapperConfig, dump, load_config
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
@@ -33,6 +33,7 @@ from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.errors import input_read, one_line
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.truth import Truth
+from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.processes.interrupts import keeping

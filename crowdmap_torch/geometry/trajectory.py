@@ -1,10 +1,15 @@
-"""Way along a trajectory."""
+"""Way along a trajectory, and how it is moved along."""
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+
+from crowdmap_torch.geometry import se3
+
+_HALF_WINDOW_S = 0.2
+"""Velocities are differences over about twice this: over single frames the poses' own noise would be most of them."""
 
 
 def station(T_world_camera: Float[Tensor, "f 4 4"], *, half_window: int = 7) -> Float[Tensor, " f"]:
@@ -18,3 +23,18 @@ def station(T_world_camera: Float[Tensor, "f 4 4"], *, half_window: int = 7) -> 
     ahead, behind = (index + half_window).clamp_max(last), (index - half_window).clamp_min(0)
     speed = (position[ahead] - position[behind]).norm(dim=-1) / (ahead - behind).clamp_min(1)
     return torch.cat((speed.new_zeros(1), ((speed[1:] + speed[:-1]) / 2).cumsum(0)))[: last + 1]
+
+
+def motion(
+    T_world_camera: Float[Tensor, "f 4 4"], t_ns: Int[Tensor, " f"]
+) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
+    """Velocity along the world's axes [m/s] and turning about the camera's own [rad/s], of every frame."""
+    T = T_world_camera
+    if not len(T):
+        return T[:, :3, 3], T[:, :3, 3]
+    t_s = (t_ns - t_ns[0]).to(T) * 1e-9
+    low = torch.searchsorted(t_s, t_s - _HALF_WINDOW_S).clamp_max(len(t_s) - 1)
+    high = (torch.searchsorted(t_s, t_s + _HALF_WINDOW_S, right=True) - 1).clamp_min(0)
+    step = (t_s[high] - t_s[low]).clamp_min(1e-3)[:, None]
+    turned = T[low, :3, :3].mT @ T[high, :3, :3]
+    return (T[high, :3, 3] - T[low, :3, 3]) / step, se3.so3_log(turned) / step

@@ -5,20 +5,17 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.io.documents import Document, read_json, write_json
 from crowdmap_torch.io.rigs import rig_yaml
+from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.tables import Rig
 
 FORMAT = "crowdmap-calibration"
-Numbers = Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
-"""Of one car: estimates and sigmas of every parameter."""
 _URDF = """<?xml version="1.0"?>
 <robot name="rig">
   <link name="base_link"/>
@@ -37,7 +34,7 @@ def write_calibration(path: Path, cars: Mapping[str, Mapping[str, object]]) -> N
     write_json(path, {"format": FORMAT, "version": 1, "cars": dict(cars)})
 
 
-def read_calibration(path: Path) -> dict[str, Numbers]:
+def read_calibration(path: Path) -> dict[str, KnownCalibration]:
     """Estimates and sigmas of every car of a calibration.json; InputError for what breaks FORMAT.md."""
     document = read_json(path)
     document.require_format(FORMAT)
@@ -45,7 +42,7 @@ def read_calibration(path: Path) -> dict[str, Numbers]:
     return {name: _numbers(cars.part(name)) for name in cars.content}
 
 
-def _numbers(car: Document) -> Numbers:
+def _numbers(car: Document) -> KnownCalibration:
     parameters = car.part("parameters")
     found = {}
     for name in parameters.content:
@@ -56,28 +53,6 @@ def _numbers(car: Document) -> Numbers:
             raise one.fault("expected numbers above 0", "sigma")
         found[name] = (tuple(estimate), tuple(sigma))
     return found
-
-
-def corrected_rig(rig: Rig, numbers: Numbers) -> Rig:
-    """The rig with what was found put right: focal length, principal point, mount and height above the road."""
-
-    def found(name: str, count: int) -> torch.Tensor:
-        values = numbers[name][0] if name in numbers else (0.0,) * count
-        return torch.tensor(values, dtype=torch.float64, device=rig.T_link_camera.device)
-
-    K = rig.camera.K.clone()
-    K[[0, 1], [0, 1]] *= 1 + found("focal", 1)
-    K[:2, 2] += found("principal_px", 2)
-    T = torch.eye(4).to(rig.T_link_camera)
-    T[:3, :3] = se3.so3_exp(torch.deg2rad(found("mount_deg", 3)))
-    T[:3, 3] = found("mount_m", 3)
-    return replace(
-        rig,
-        camera=replace(rig.camera, K=K),
-        T_link_camera=rig.T_link_camera @ T,
-        road_normal_camera=T[:3, :3].mT @ rig.road_normal_camera,
-        camera_height=rig.camera_height + float(found("height_m", 1)),
-    )
 
 
 def write_corrected_rigs(folder: Path, rigs: Sequence[tuple[str, Rig]]) -> None:

@@ -6,15 +6,14 @@ from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 
-from crowdmap_torch.adjustment.calibration import KnownCalibration
 from crowdmap_torch.adjustment.found_calibration import FleetCalibration
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.found_calibration import (
-    corrected_rig,
     read_calibration,
     write_calibration,
     write_corrected_rigs,
 )
+from crowdmap_torch.noise.calibration import KnownCalibration, corrected_rig
 from crowdmap_torch.tables import Dataset
 
 _FILE = "calibration.json"

@@ -25,7 +25,6 @@ import torch
 
 from crowdmap_torch import __version__
 from crowdmap_torch.adjustment.adjust import Standing
-from crowdmap_torch.adjustment.calibration import KnownCalibration
 from crowdmap_torch.config import MapperConfig, as_dict
 from crowdmap_torch.io.atomic import drop_halves
 from crowdmap_torch.io.documents import read_json, write_json
@@ -34,6 +33,7 @@ from crowdmap_torch.io.stages import read_stage, write_stage
 from crowdmap_torch.io.trees import digest
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import FirstMap, JourneyMap
+from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.report.watch import Course, Residuals
 from crowdmap_torch.tables import Dataset, Survey
 

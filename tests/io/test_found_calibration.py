@@ -13,13 +13,13 @@ from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.found_calibration import (
-    corrected_rig,
     folder_name,
     read_calibration,
     write_calibration,
     write_corrected_rigs,
 )
 from crowdmap_torch.io.rigs import read_rig
+from crowdmap_torch.noise.calibration import corrected_rig
 from crowdmap_torch.tables import Rig
 
 F64 = torch.float64
