@@ -43,7 +43,7 @@ class CalibrationConfig(Settings):
 
     mount_deg: Degrees = 0.2
     """Turn of the camera about each of its axes against the stated mount."""
-    mount_m: LengthOrNone = 0.0
+    mount_m: LengthOrNone = 0.05
     """Place of the camera against the stated mount, along its axes."""
     clock_s: Share = 0.015
     """Time by which pictures are taken later than they and their poses are stamped."""
