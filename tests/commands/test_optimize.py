@@ -416,9 +416,11 @@ def test_what_looks_wrong_is_said_before_mapping_and_kept(
         swap_axes(journey)
     said = optimize(copy, tmp_path / "run")
     lines = [line for line in said.err.splitlines() if line.startswith("looks wrong: ")]
-    assert len(lines) == 1 and "quaternions are stored as w x y z; store qx qy qz qw" in lines[0]
-    (warning,) = json.loads((tmp_path / "run" / "metrics.json").read_text())["warnings"]
-    assert warning["kind"] == "quaternion-order"
+    assert "quaternions are stored as w x y z; store qx qy qz qw" in lines[0]
+    # What becomes of such a map is another matter: it may have no sign, which is said after it.
+    warning, *after = json.loads((tmp_path / "run" / "metrics.json").read_text())["warnings"]
+    assert warning["kind"] == "quaternion-order" and len(lines) == 1 + len(after)
+    assert all(one["kind"].startswith("no-") for one in after)
     assert warning["journeys"] == [path.name for path in journeys_of(copy)]
 
 
