@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,6 +26,8 @@ from crowdmap_torch.tables import Dataset, Journey, Origin, RejectedJourney, Rig
 
 DATASET_FORMAT = "crowdmap-dataset"
 JOURNEY_FORMAT = "crowdmap-journey"
+_LONGEST_NAME = 100
+"""Characters of a vehicle's name; a longer one is cut and told apart by a number."""
 
 
 def load_dataset(
@@ -185,8 +188,15 @@ def _load_journey(
 
 
 def _vehicle_id(stated: object) -> str:
-    """A name, or a number for one; whatever else is there names nobody."""
-    return str(stated) if isinstance(stated, str | int) and not isinstance(stated, bool) else ""
+    """A name, or a number for one, as it can be shown anywhere; whatever else is there names nobody."""
+    if isinstance(stated, bool) or not isinstance(stated, str | int):
+        return ""
+    if isinstance(stated, int) and abs(stated) >= 10**_LONGEST_NAME:
+        return ""
+    plain = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in str(stated))
+    if len(plain) <= _LONGEST_NAME:
+        return plain
+    return f"{plain[:_LONGEST_NAME]}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}"
 
 
 def _copies(journeys: Sequence[Journey]) -> dict[str, str]:

@@ -398,3 +398,31 @@ def test_real_drives_load(real_data, drive) -> None:
     assert len(journey.lanes) == 0
     origin = json.loads((folder / "dataset.json").read_text())["origin"]
     assert dataset.origin.lat_deg == origin["lat_deg"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "vehicle"),
+    [
+        ("van 7", "van 7"),
+        (7, "7"),
+        ("\ud800", "\\ud800"),
+        ("a\nb", "a\\u000ab"),
+        (None, "r"),
+        ("", "r"),
+        (True, "r"),
+        ([1], "r"),
+        (10**3000, "r"),
+    ],
+)
+def test_a_car_has_a_name_that_can_be_shown(sound, stated: object, vehicle: str):
+    rig = sound.journeys["b"].head["rig"]
+    sound.journeys["b"].head |= {"vehicle_id": stated}
+    found = next(j for j in load_dataset(sound.write()).journeys if j.journey_id == "b")
+    assert found.vehicle == (rig if vehicle == "r" else vehicle)
+
+
+def test_long_names_of_cars_are_told_apart(sound):
+    for name, end in (("a", "x"), ("b", "y")):
+        sound.journeys[name].head |= {"vehicle_id": "v" * 5000 + end}
+    one, other = (j.vehicle for j in load_dataset(sound.write()).journeys[:2])
+    assert one != other and max(len(one), len(other)) < 120
