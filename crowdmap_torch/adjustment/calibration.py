@@ -23,6 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
+from crowdmap_torch.clustering.groups import group_sum
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.geometry.trajectory import motion
 from crowdmap_torch.noise.calibration import KnownCalibration
@@ -246,23 +247,22 @@ class Fleet:
             left = torch.linalg.cross(-rows.normal_camera, ahead)
             left = torch.nn.functional.normalize(left, dim=-1)
             by[..., at["lane_m"]] = (by_point @ left[..., None]) * config.lane_m
-        height = by.new_zeros(len(rows), 0 if of_corners else 1, by.shape[-1])
-        if not of_corners:
-            self._tilt_road(height, rows, lenses, point_camera)
-        return ByOptics(by, height)
+        if isinstance(rows, CornerObservations):
+            return ByOptics(by, by[:, :0])
+        return ByOptics(by, self._by_height(rows, lenses, point_camera))
 
-    def _tilt_road(
+    def _by_height(
         self,
-        height: Float[Tensor, "m 1 k"],
         rows: LanePointObservations,
         lenses: Sequence[Camera],
         point_camera: Float[Tensor, "m 3"],
-    ) -> None:
-        """Derivatives of the height of lane points over the road plane under the camera, into `height`.
+    ) -> Float[Tensor, "m 1 k"]:
+        """Derivatives of the height of lane points over the road plane under the camera.
 
         The plane's normal n was read off the image, by the stated camera: its horizon stays where it is in the image.
         """
         config, at = self.config, columns("optics", self.config)
+        height = point_camera.new_zeros(len(rows), 1, width("optics", config))
         n, (x, y, z) = rows.normal_camera, point_camera.unbind(-1)
         above = (n * point_camera).sum(-1)
         flat = n[:, 0].square() + n[:, 1].square()
@@ -275,6 +275,7 @@ class Fleet:
             height[:, 0, at["principal_px"]] = n[:, :2] / focal * sunk * config.principal_px
         if "height_m" in at:
             height[:, 0, at["height_m"]] = -config.height_m
+        return height
 
 
 def fleet_of(
@@ -313,8 +314,6 @@ def fleet_of(
 
 
 def _means(value: Float[Tensor, "m 2"], group: Int[Tensor, " m"]) -> Float[Tensor, "m 2"]:
-    """The mean of each row's group."""
-    _, of = torch.unique(group, return_inverse=True)
-    count = torch.bincount(of)
-    total = value.new_zeros(len(count), 2).index_add_(0, of, value)
-    return (total / count[:, None])[of]
+    """The mean of each row's group; the rows of a group are adjacent."""
+    _, of, count = torch.unique_consecutive(group, return_inverse=True, return_counts=True)
+    return (group_sum(value, of, len(count)) / count[:, None])[of]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 
+from crowdmap_torch.adjustment.calibration import VARIABLES
 from crowdmap_torch.adjustment.found_calibration import FleetCalibration
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.found_calibration import (
@@ -60,4 +62,12 @@ def read_found(run: Path) -> dict[str, KnownCalibration]:
         raise InputError(
             f"--calibration {run}: expected a run with {_FILE} in it, or off; none is there"
         )
-    return dict(read_calibration(path))
+    found = read_calibration(path)
+    for car, numbers in found.items():
+        for one in chain(*VARIABLES.values()):
+            count = len(numbers[one.name][0]) if one.name in numbers else one.count
+            if count != one.count:
+                raise InputError(
+                    f"{path}: cars.{car}.parameters.{one.name}: expected {one.count} numbers, found {count}"
+                )
+    return dict(found)

@@ -400,6 +400,18 @@ def test_a_calibration_that_is_not_there_is_one_line(optimize, tiny_folder: Path
     assert "calibration.json" in said.err and not (tmp_path / "run").exists()
 
 
+def test_a_calibration_with_too_few_numbers_is_one_line(
+    optimize, run: Path, tiny_folder: Path, tmp_path: Path
+):
+    content = json.loads((run / "calibration.json").read_text())
+    car = next(iter(content["cars"].values()))
+    car["parameters"]["mount_deg"] |= {"estimate": [0.1, 0.2], "sigma": [0.1, 0.1]}
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    said = optimize(tiny_folder, tmp_path / "run", "--calibration", str(tmp_path))
+    assert said.code == 2 and said.err.count("\n") == 1
+    assert "mount_deg: expected 3 numbers, found 2" in said.err
+
+
 def test_control_points_of_another_place_are_one_line(optimize, copy: Path, tmp_path: Path):
     control = Path(shutil.copytree(copy / "survey", tmp_path / "control"))
     head = json.loads((control / "map.json").read_text())
