@@ -235,11 +235,12 @@ def _read(options: argparse.Namespace, config: MapperConfig, device: torch.devic
         truth = read_truth_of(options.dataset, dataset, survey)
     with reading(config.reading):
         control = options.control and read_survey_at(options.control, dataset.origin)
-        earlier = options.calibration
-        cars = {} if earlier in (None, _OFF) else read_found(Path(earlier))
-    if cars and (new := sorted({journey.vehicle for journey in dataset.journeys} - cars.keys())):
+        is_known = (earlier := options.calibration) not in (None, _OFF)
+        cars = read_found(Path(earlier), dataset.journeys) if is_known else {}
+    new = sorted({journey.vehicle for journey in dataset.journeys} - cars.keys())
+    if is_known and new:
         names = ", ".join(new[:5]) + (f" and {len(new) - 5} others" if len(new) > 5 else "")
-        print(f"--calibration {earlier}: nothing is known of {names}", file=sys.stderr)
+        print(f"warning: --calibration {earlier}: nothing is known of {names}", file=sys.stderr)
     return _Given(dataset, survey, truth, control, cars)
 
 

@@ -13,9 +13,23 @@ from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.io.documents import Document, read_json, write_json
 from crowdmap_torch.io.rigs import rig_yaml
 from crowdmap_torch.noise.calibration import KnownCalibration
+from crowdmap_torch.ranges import Range
 from crowdmap_torch.tables import Rig
 
 FORMAT = "crowdmap-calibration"
+_WRONG = {
+    "mount_deg": Range(-45, 45, "degrees: a camera turned further has another mount"),
+    "mount_m": Range(-10, 10, "metres: a camera further off sits on another car"),
+    "clock_s": Range(-10, 10, "seconds: a clock that is later is none"),
+    "focal": Range(-0.5, 1, "a share: from half the focal length to twice"),
+    "principal_px": Range(-1e4, 1e4, "pixels: the middle of an image is not as far off"),
+    "read_out_s": Range(-1, 1, "seconds: no picture takes longer"),
+    "box": Range(-0.5, 1, "a share: from half the outline to twice"),
+    "corner_px": Range(-1e3, 1e3, "pixels: corners further off are of something else"),
+    "lane_m": Range(-10, 10, "metres: a marker further off is another one"),
+    "height_m": Range(-100, 100, "metres: no camera is as high"),
+}
+"""How wrong a car can be, by parameter."""
 _URDF = """<?xml version="1.0"?>
 <robot name="rig">
   <link name="base_link"/>
@@ -48,6 +62,9 @@ def _numbers(car: Document) -> KnownCalibration:
     for name in parameters.content:
         one = parameters.part(name)
         estimate = one.numbers("estimate", most=1e6)
+        for value in estimate:
+            if rule := name in _WRONG and _WRONG[name].fault(value):
+                raise one.fault(rule, "estimate")
         sigma = one.numbers("sigma", len(estimate), most=1e6)
         if min(sigma, default=1.0) <= 0:
             raise one.fault("expected numbers above 0", "sigma")

@@ -68,25 +68,43 @@ def rig_yaml(
     mount: tuple[str, str, str] | None = None,
 ) -> str:
     """The text of rig.yaml; `mount` are its URDF file, the link of the poses and that of the camera."""
-    K = camera.K.tolist()
-    lines = [
-        "camera:",
-        f"  model: {camera.model}",
-        f"  width: {camera.width}",
-        f"  height: {camera.height}",
-        f"  fx: {K[0][0]!r}",
-        f"  fy: {K[1][1]!r}",
-        f"  cx: {K[0][2]!r}",
-        f"  cy: {K[1][2]!r}",
-        f"  distortion: [{', '.join(repr(float(k)) for k in camera.distortion)}]",
-        "road:",
-        f"  normal: [{', '.join(repr(float(x)) for x in road_normal_camera)}]",
-        f"  height_m: {camera_height!r}",
-    ]
+    lines = []
+    for name, section in _sections(camera, road_normal_camera, camera_height).items():
+        lines += [f"{name}:", *(f"  {k}: {v}" for k, v in section.items())]
     if mount is not None:
         names = ("urdf", "pose_link", "camera_link")
         lines += ["mount:", *(f"  {k}: {v}" for k, v in zip(names, mount, strict=True))]
     return "\n".join(lines) + "\n"
+
+
+def refuse_unreadable(rig: Rig, path: Path, section: str) -> None:
+    """InputError, at a section of a file, unless rig.yaml and rig.urdf of this rig would be read."""
+    content = _sections(rig.camera, rig.road_normal_camera.tolist(), rig.camera_height)
+    document = Document(path, content, section)
+    _read_camera(document.part("camera"))
+    _read_road(document.part("road"))
+    if rule := _too_far(rig.T_link_camera):
+        raise document.fault(rule)
+
+
+def _sections(
+    camera: Camera, road_normal_camera: Iterable[float], camera_height: float
+) -> dict[str, dict[str, object]]:
+    """What rig.yaml has of a rig beside its mount."""
+    K = camera.K.tolist()
+    return {
+        "camera": {
+            "model": camera.model,
+            "width": camera.width,
+            "height": camera.height,
+            "fx": K[0][0],
+            "fy": K[1][1],
+            "cx": K[0][2],
+            "cy": K[1][2],
+            "distortion": camera.distortion.tolist(),
+        },
+        "road": {"normal": [float(x) for x in road_normal_camera], "height_m": camera_height},
+    }
 
 
 def _read_camera(section: Document) -> Camera:
@@ -142,8 +160,14 @@ def _read_mount(section: Document, folder: Path) -> Float[Tensor, "4 4"]:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: {one_line(error)}") from error
-    if not float(T[:3, 3].norm()) <= MAX_MOUNT_M:
-        away = f"{float(T[:3, 3].norm()):.4g} m"
-        rule = f"the camera is {away} from the pose link; expected {MAX_MOUNT_M:g} m at most"
+    if rule := _too_far(T):
         raise InputError(f"{path}: {rule}")
     return T
+
+
+def _too_far(T_link_camera: Float[Tensor, "4 4"]) -> str | None:
+    """What is expected of a mount, if the camera is too far from the link."""
+    away = float(T_link_camera[:3, 3].norm())
+    if away <= MAX_MOUNT_M:
+        return None
+    return f"the camera is {away:.4g} m from the pose link; expected {MAX_MOUNT_M:g} m at most"

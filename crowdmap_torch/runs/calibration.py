@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -15,8 +16,9 @@ from crowdmap_torch.io.found_calibration import (
     write_calibration,
     write_corrected_rigs,
 )
+from crowdmap_torch.io.rigs import refuse_unreadable
 from crowdmap_torch.noise.calibration import KnownCalibration, corrected_rig
-from crowdmap_torch.tables import Dataset
+from crowdmap_torch.tables import Dataset, Journey, Rig
 
 _FILE = "calibration.json"
 
@@ -26,7 +28,7 @@ def write_found(folder: Path, dataset: Dataset, found: FleetCalibration) -> None
     if not found:
         return
     journeys = Counter(journey.vehicle for journey in dataset.journeys)
-    rig_of = {journey.vehicle: journey.rig for journey in reversed(dataset.journeys)}
+    rig_of = _rigs(dataset.journeys)
     cars = {}
     for name, car in found.items():
         parts = asdict(car)
@@ -55,8 +57,12 @@ def write_found(folder: Path, dataset: Dataset, found: FleetCalibration) -> None
     write_corrected_rigs(folder / "rigs", rigs)
 
 
-def read_found(run: Path) -> dict[str, KnownCalibration]:
-    """What the run in a folder found of its cars; InputError where there is no such run, or it asked for no calibration."""
+def read_found(run: Path, journeys: Sequence[Journey]) -> dict[str, KnownCalibration]:
+    """What the run in a folder found of its cars.
+
+    InputError where there is no such run, it asked for no calibration, or what it found makes no rig of one of the
+    cars of `journeys`.
+    """
     path = run / _FILE
     if not path.exists():
         raise InputError(
@@ -70,4 +76,12 @@ def read_found(run: Path) -> dict[str, KnownCalibration]:
                 raise InputError(
                     f"{path}: cars.{car}.parameters.{one.name}: expected {one.count} numbers, found {count}"
                 )
-    return dict(found)
+    for car, rig in _rigs(journeys).items():
+        if car in found:
+            refuse_unreadable(corrected_rig(rig, found[car]), path, f"cars.{car}, rig put right")
+    return found
+
+
+def _rigs(journeys: Sequence[Journey]) -> dict[str, Rig]:
+    """The stated rig of every car: that of its first journey."""
+    return {journey.vehicle: journey.rig for journey in reversed(journeys)}

@@ -28,8 +28,9 @@ from crowdmap_torch.soak.verdict import (
     problems_of_run,
 )
 
-KINDS = {"data set": 0.55, "configuration": 0.15, "evaluation": 0.3}
-"""What is destroyed, and how often: a data set, the file of --config, what `crowdmap evaluate` compares."""
+KINDS = {"data set": 0.45, "configuration": 0.15, "evaluation": 0.25, "calibration": 0.15}
+"""What is destroyed, and how often: a data set, the file of --config, what `crowdmap evaluate` compares, and what an
+earlier run found of its cars."""
 _BENT = 0.2
 """Share of the data sets whose lenses bend."""
 _DRAWN = 0.05
@@ -113,6 +114,15 @@ def _configuration(good: Good, inputs: Path, rng: np.random.Generator) -> _Trial
     return _optimize(good.plain, (folder,), ["--config", str(path)], rng)
 
 
+def _calibration(good: Good, inputs: Path, rng: np.random.Generator) -> _Trial:
+    earlier, config = inputs / "earlier", inputs / "quick.yaml"
+    earlier.mkdir()
+    shutil.copy(good.run / "calibration.json", earlier)
+    config.write_text(QUICK)
+    options = ["--config", str(config), "--calibration", str(earlier)]
+    return _optimize(good.plain, (earlier,), options, rng)
+
+
 def _optimize(
     data: Path, destroyed: tuple[Path, ...], options: list[str], rng: np.random.Generator
 ) -> _Trial:
@@ -156,6 +166,7 @@ _TRIALS: dict[str, Callable[[Good, Path, np.random.Generator], _Trial]] = {
     "data set": _data_set,
     "configuration": _configuration,
     "evaluation": _evaluation,
+    "calibration": _calibration,
 }
 
 

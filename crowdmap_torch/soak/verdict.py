@@ -15,6 +15,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.found_calibration import folder_name, read_calibration
+from crowdmap_torch.io.rigs import read_rig
 from crowdmap_torch.soak.child import RESIDENT_BYTES, SECONDS, Outcome
 
 EXIT_CODES = (0, 1, 2, 3)
@@ -75,6 +78,18 @@ def problems_of_run(data: Path, run: Path, outcome: Outcome) -> Iterator[str]:
     """What is broken of the folder of a run that ended well."""
     yield from _of_map(run)
     yield from _of_journeys(data, run, outcome)
+    yield from problems_of_calibration(run)
+
+
+def problems_of_calibration(run: Path) -> Iterator[str]:
+    """What of the cars that a run found cannot be begun with, or used."""
+    found = run / "calibration.json"
+    try:
+        cars = read_calibration(found) if found.exists() else {}
+        for car in cars:
+            read_rig(run / "rigs" / folder_name(car))
+    except InputError as error:
+        yield f"what was found of cars is not to be read: {error}"
 
 
 def problems_of_figures(path: Path, hd_map: Path, survey: Path) -> Iterator[str]:

@@ -371,19 +371,21 @@ def test_a_run_says_what_its_cars_have_wrong(run: Path, tiny: Dataset):
     assert any(tag.startswith("calibration/mount_deg_0/") for tag in board.Tags()["scalars"])
 
 
-def test_what_a_run_found_of_cars_is_begun_with(
+def test_what_a_run_found_of_cars_is_begun_with_and_others_are_named(
     optimize, run: Path, tiny_folder: Path, tmp_path: Path, quick: None
 ):
-    said = optimize(tiny_folder, tmp_path / "again", "--calibration", str(run))
-    assert said.code == 0 and "nothing is known" not in said.err
-    before, after = (
-        json.loads((folder / "calibration.json").read_text())["cars"]
-        for folder in (run, tmp_path / "again")
-    )
-    for name, car in after.items():
+    content = json.loads((run / "calibration.json").read_text())
+    before = content["cars"]
+    new, _ = before.popitem()
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    said = optimize(tiny_folder, tmp_path / "again", "--calibration", str(tmp_path))
+    assert said.code == 0 and before
+    assert said.err.startswith(f"warning: --calibration {tmp_path}: nothing is known of {new}\n")
+    after = json.loads((tmp_path / "again" / "calibration.json").read_text())["cars"]
+    for name, car in before.items():
         for key, one in car["parameters"].items():
-            known = before[name]["parameters"][key]
-            assert one["prior_sigma"] == pytest.approx(known["sigma"], rel=1e-9)
+            found = after[name]["parameters"][key]
+            assert found["prior_sigma"] == pytest.approx(one["sigma"], rel=1e-9)
 
 
 def test_calibration_off_leaves_rigs_as_they_are(
@@ -392,6 +394,31 @@ def test_calibration_off_leaves_rigs_as_they_are(
     assert optimize(tiny_folder, tmp_path / "run", "--calibration", "off").code == 0
     assert not (tmp_path / "run" / "calibration.json").exists()
     assert not (tmp_path / "run" / "rigs").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "estimate", "message"),
+    [
+        ("height_m", [-5.0], "rig put right.road.height_m: expected a number in 0.01"),
+        ("mount_deg", [0.1, 0.1], "mount_deg: expected 3 numbers, found 2"),
+    ],
+)
+def test_a_calibration_that_makes_no_rig_is_one_line(
+    optimize,
+    run: Path,
+    tiny_folder: Path,
+    tmp_path: Path,
+    name: str,
+    estimate: list[float],
+    message,
+):
+    content = json.loads((run / "calibration.json").read_text())
+    for car in content["cars"].values():
+        car["parameters"][name] |= {"estimate": estimate, "sigma": [0.1] * len(estimate)}
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    said = optimize(tiny_folder, tmp_path / "run", "--calibration", str(tmp_path))
+    assert said.code == 2 and said.err.count("\n") == 1
+    assert message in said.err and not (tmp_path / "run").exists()
 
 
 def test_a_calibration_that_is_not_there_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):

@@ -88,6 +88,7 @@ def test_numbers_are_read_as_they_were_written(tmp_path: Path) -> None:
         ({"sigma": [0.0]}, r"cars\.a\.parameters\.focal\.sigma: expected numbers above 0"),
         ({"sigma": [1.0, 2.0]}, r"focal\.sigma"),
         ({"estimate": ["x"]}, r"focal\.estimate"),
+        ({"estimate": [-1.0]}, r"focal\.estimate: expected -0\.5 to 1 \(a share"),
         ({"estimate": [float("inf")]}, "calibration.json"),
     ],
 )

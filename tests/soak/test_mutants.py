@@ -6,6 +6,8 @@ from pathlib import Path
 
 from worlds.programs import begin
 
+from crowdmap_torch.soak.attempt import KINDS
+
 
 def test_destroyed_inputs_break_nothing(tmp_path: Path) -> None:
     # In a process of its own: one with threads, as this one may be, is not to be forked.
@@ -16,4 +18,4 @@ def test_destroyed_inputs_break_nothing(tmp_path: Path) -> None:
     out, err = program.communicate()
     assert program.returncode == 0, out + err
     assert "12 mutants" in out and "0 failures" in out
-    assert all(f"{kind}: exit codes" in out for kind in ("data set", "configuration", "evaluation"))
+    assert all(f"{kind}: exit codes" in out for kind in KINDS)

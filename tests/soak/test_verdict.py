@@ -9,11 +9,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
+from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.io.found_calibration import write_calibration
+from crowdmap_torch.io.rigs import rig_yaml
 from crowdmap_torch.soak import child, verdict
 from crowdmap_torch.soak.child import Outcome, run_apart
 from crowdmap_torch.soak.verdict import (
     digest,
+    problems_of_calibration,
     problems_of_figures,
     problems_of_limits,
     problems_of_outcome,
@@ -103,3 +108,18 @@ def test_figures_that_are_no_numbers_or_of_other_signs_are_seen(
         path.write_text(json.dumps({**good, **wrong}))
         found = list(problems_of_figures(path, survey, survey))
         assert found == ([] if problem is None else [problem])
+
+
+def test_what_was_found_of_cars_has_to_be_read_and_used(tmp_path: Path) -> None:
+    path, rig = tmp_path / "calibration.json", tmp_path / "rigs" / "a"
+    assert list(problems_of_calibration(tmp_path)) == []
+    focal = {"estimate": [0.001], "sigma": [1e-4]}
+    write_calibration(path, {"a": {"parameters": {"focal": focal}}})
+    assert "rig's folder is missing" in next(iter(problems_of_calibration(tmp_path)))
+    rig.mkdir(parents=True)
+    K = torch.tensor([[1000.0, 0, 640], [0, 1000, 400], [0, 0, 1]])
+    camera = Camera("brown_conrady", 1280, 800, K, torch.zeros(4))
+    (rig / "rig.yaml").write_text(rig_yaml(camera, (0.0, 1.0, 0.0), 1.4))
+    assert list(problems_of_calibration(tmp_path)) == []
+    (rig / "rig.yaml").write_text(rig_yaml(camera, (0.0, 1.0, 0.0), -1.4))
+    assert "road.height_m" in next(iter(problems_of_calibration(tmp_path)))
