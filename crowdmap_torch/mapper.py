@@ -19,7 +19,7 @@ from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
 from crowdmap_torch.adjustment.lane_matching import detection_lanes
 from crowdmap_torch.config import MapperConfig, config_hash
-from crowdmap_torch.crowd_lanes.cluster import cluster_lanes
+from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
 from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_lanes
 from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
 from crowdmap_torch.crowd_signs.align import unbiased_poses
@@ -97,6 +97,8 @@ class FirstMap:
     """Which lane each place of the journeys' own lane pieces is of."""
     tentative: Signs
     """Signs that too few journeys saw."""
+    lane_rounds: tuple[LaneRound, ...]
+    """Clusterings of the journeys' lane pieces (`paper2017`; else none)."""
     crowd: Crowd
     associations: tuple[Association, ...]
     drifts: tuple[Float[Tensor, "_ 6"], ...]
@@ -239,6 +241,7 @@ def first_map(
         clusters = cluster_lanes(pieces, config.lane_cluster, generator=generator)
         lanes = clusters.heads
         support = support_of_pieces(pieces, clusters.label, config.lane_join.sample_spacing_m)
+        rounds = clusters.rounds
     else:
         # Bad drives leave nothing behind: where they are off is not known well enough to move their pieces.
         trusted = (crowd.journey_weight > 0).tolist()
@@ -247,12 +250,13 @@ def first_map(
             for pieces, drift, is_good in zip(made, drifts, trusted, strict=True)
         ]
         joined = join_lanes(concatenate_lanes(moved), config.positioning, config.lane_join)
-        lanes, support = joined.lanes, joined.support
+        lanes, support, rounds = joined.lanes, joined.support, ()
     return FirstMap(
         signs=found.heads,
         lanes=lanes,
         lane_support=support,
         tentative=found.tentative,
+        lane_rounds=rounds,
         crowd=crowd,
         associations=found.associations,
         drifts=drifts,

@@ -6,8 +6,8 @@ for and grows fast below it, made orthonormal, and turned to the Ritz vectors it
 of the sparse matrix with the block and small dense decompositions is needed, on any device.
 
 Where that does not come to its tolerance the block is made wider, so that the filter's edge leaves the crowd that held it
-up, and a graph that memory allows is decomposed whole. Of a larger one the best vectors count: they are those of a graph
-that differs by their residual, which k-means and a cut do not notice.
+up, and a graph that memory allows is decomposed whole. Of a larger one the best vectors count, and how far they miss is
+told: they are those of a graph that differs by their residual, which k-means and a cut hardly notice.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -56,6 +56,8 @@ class LeadingPairs:
     """Even the last of them is small: there are more clusters than they can tell."""
     vectors: Float[Tensor, "n c"]
     """Orthonormal eigenvectors, residuals below 1e-8: those before the widest gap; the first two where all are crowded."""
+    miss: float = 0.0
+    """Largest residual that a value or a vector has, where one did not come to its tolerance; else 0."""
 
 
 def leading_eigenpairs(graph: Graph, count: int, *, crowded_below: float) -> LeadingPairs:
@@ -75,7 +77,7 @@ def leading_eigenpairs(graph: Graph, count: int, *, crowded_below: float) -> Lea
         found = wider if wider.is_there or wider.miss < found.miss else found
     if not found.is_there and graph.size <= _LAST_WHOLE:
         return _whole(graph, scaled, count, crowded_below)
-    return found.pairs
+    return found.pairs if found.is_there else replace(found.pairs, miss=found.worst)
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,8 @@ class _Found:
     """Whether it came to its tolerance."""
     miss: float
     """Largest residual of the vectors before the gap."""
+    worst: float
+    """Of all that were asked for."""
 
 
 def _whole(
@@ -112,7 +116,8 @@ def _iterated(
         is_there = exact <= max(_TOLERANCE, least) and (
             pairs.crowded or bool((miss <= max(_VALUE_TOLERANCE, least)).all())
         )
-        best = _Found(pairs, is_there, exact)
+        worst = exact if pairs.crowded else max(exact, float(miss.max()))
+        best = _Found(pairs, is_there, exact, worst)
         if is_there:
             break
         # Beyond eps^-0.6 the last vectors of the block would be lost in the rounding of the first.

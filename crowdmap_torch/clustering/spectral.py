@@ -67,6 +67,8 @@ class SpectralClusters:
     """Piece of the graph that was decomposed as one."""
     eigenvalues: Float[Tensor, " m"]
     """Of the normalised Laplacians of all pieces, ascending; of large pieces the leading ones."""
+    miss: float
+    """Largest residual of eigenpairs, where one did not come to its tolerance; else 0."""
 
 
 def normalized_laplacian(similarity: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
@@ -146,8 +148,8 @@ def cluster_graph(
     """
     graph = symmetric_graph(edge, similarity, n)
     piece = connected_components(graph.row, graph.column, n)
-    piece, pieces, large = _decompose_large(graph, piece, config)
-    found = [*large, *_decompose_small(graph, piece, pieces, config)]
+    cut = _decompose_large(graph, piece, config)
+    found = [*cut.decomposed, *_decompose_small(graph, cut.piece, cut.count, config)]
     if whole is not None:
         found = _counted_together(found, whole.cpu())
     label = _labels_of(found, n, config, generator)
@@ -155,8 +157,9 @@ def cluster_graph(
     return SpectralClusters(
         label=label.to(edge.device),
         count=int(label.max()) + 1 if n else 0,
-        component=renumber(piece),
+        component=renumber(cut.piece),
         eigenvalues=eigenvalues.to(edge.device),
+        miss=cut.miss,
     )
 
 
@@ -194,6 +197,19 @@ class _Piece:
     """Clusters in it, by its own gap."""
 
 
+@dataclass(frozen=True)
+class _Large:
+    """A graph whose large components were cut and decomposed."""
+
+    piece: Int[Tensor, " n"]
+    """Of each node; some numbers have none."""
+    count: int
+    decomposed: list[_Piece]
+    """The large ones."""
+    miss: float
+    """Largest residual of eigenpairs, where one did not come to its tolerance; else 0."""
+
+
 def _counted_together(pieces: list[_Piece], whole: Int[Tensor, " n"]) -> list[_Piece]:
     """The pieces with as many clusters each as it has eigenvalues below the gap in those of its whole."""
     of = [int(whole[piece.nodes[0]]) for piece in pieces]
@@ -222,18 +238,17 @@ def _labels_of(
     return renumber(label)
 
 
-def _decompose_large(
-    graph: Graph, piece: Int[Tensor, " n"], config: SpectralConfig
-) -> tuple[Int[Tensor, " n"], int, list[_Piece]]:
-    """The pieces of all nodes after cuts of large components, their number, and the leading eigenpairs of the large ones."""
+def _decompose_large(graph: Graph, piece: Int[Tensor, " n"], config: SpectralConfig) -> _Large:
+    """Large components cut until the leading eigenpairs of what is left tell its clusters."""
     piece, most = piece.clone(), config.whole_limit
     size = torch.bincount(piece)
     pieces = len(size)
     large = list(parts(graph, renumber(piece.masked_fill(size[piece] <= most, -1))))
-    found = []
+    found, miss = [], 0.0
     while large:
         part = large.pop()
         pairs = leading_eigenpairs(part, config.leading, crowded_below=config.cut_below)
+        miss = max(miss, pairs.miss)
         if pairs.crowded:
             for half in _fiedler_cut(part, pairs.vectors):
                 piece[half.node] = pieces
@@ -243,7 +258,7 @@ def _decompose_large(
             continue
         vectors = pairs.vectors.cpu()
         found.append(_Piece(part.node.cpu(), pairs.values.cpu(), vectors, vectors.shape[1]))
-    return piece, pieces, found
+    return _Large(piece, pieces, found, miss)
 
 
 def _decompose_small(

@@ -45,6 +45,7 @@ from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.record import record_of
 from crowdmap_torch.report.stages import keep_and_log, log_crowd
 from crowdmap_torch.report.tensorboard import TensorBoardLog
+from crowdmap_torch.report.unsettled import unsettled_findings
 from crowdmap_torch.report.watch import Watch
 from crowdmap_torch.runs.calibration import read_found
 from crowdmap_torch.runs.checkpoint import Checkpoint, Found, inputs_of
@@ -181,9 +182,9 @@ def _map(
         with _spared("figures"):
             compared = _compared(result, config, given, folder)
         progress.finish()
-        missing = missing_findings(dataset, result, config)
-        _tell(missing, dataset)
-        warnings = (*findings, *missing)
+        unsettled = _told(unsettled_findings(first), dataset)
+        missing = _told(missing_findings(dataset, result, config), dataset)
+        warnings = (*findings, *unsettled, *missing)
         metrics = metrics_of(dataset, result, config, watch.iterations, progress.seconds, *compared)
         folder.write_metrics({**metrics, "warnings": plain(warnings)})
         with _spared("report"):
@@ -263,13 +264,14 @@ def _tell_rejected(rejected: Sequence[RejectedJourney]) -> None:
 def _looked_over(folder: Path, dataset: Dataset, config: MapperConfig) -> tuple[Finding, ...]:
     with reading(config.reading):
         findings = look_over(folder, dataset, config.positioning, config.sign_association)
-    _tell(findings, dataset)
-    return tuple(findings)
+    return _told(findings, dataset)
 
 
-def _tell(findings: Sequence[Finding], dataset: Dataset) -> None:
+def _told(findings: tuple[Finding, ...], dataset: Dataset) -> tuple[Finding, ...]:
+    """The findings, each told on stderr in a line."""
     for finding in findings:
         print(f"looks wrong: {finding.line(len(dataset.journeys))}", file=sys.stderr)
+    return findings
 
 
 def _take_up(

@@ -68,6 +68,8 @@ class LaneRound:
     clusters: int
     eigenvalues: Float[Tensor, " m"]
     """Of the normalised Laplacian, ascending."""
+    miss: float
+    """Largest residual of eigenpairs, where one did not come to its tolerance; else 0."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def cluster_lanes(
         found = cluster_graph(
             edge, similarity, len(count), spectral, generator=generator, whole=one
         )
-        rounds.append(LaneRound(len(count), found.count, found.eigenvalues))
+        rounds.append(LaneRound(len(count), found.count, found.eigenvalues, found.miss))
         stands_still = found.count == len(count)
         label = found.label[label]
         control, count = _heads(packed, label, found.count, config)

@@ -72,6 +72,8 @@ class Spectrum:
     """Of the normalised Laplacian, ascending, all components together."""
     count: int
     """Clusters found: the chosen gap follows about this many eigenvalues."""
+    miss: float
+    """Largest residual of eigenpairs, where one did not come to its tolerance; else 0."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def _cluster_paper(
             edge, similarity, len(signs), spectral, generator=generator, whole=label
         )
         label = found.label
-        spectra.append(Spectrum(scale, found.eigenvalues, found.count))
+        spectra.append(Spectrum(scale, found.eigenvalues, found.count, found.miss))
     return _without_small(label, tuple(spectra), config)
 
 
@@ -157,7 +159,7 @@ def _cluster_joint(
     near = squared < limit**2
     similarity = torch.exp(-0.5 * squared[near] / config.critical_sigmas**2)
     found = cluster_graph(edge[near], similarity, len(signs), config.spectral, generator=generator)
-    spectrum = Spectrum(config.critical_sigmas, found.eigenvalues, found.count)
+    spectrum = Spectrum(config.critical_sigmas, found.eigenvalues, found.count, found.miss)
     return _without_small(found.label, (spectrum,), config)
 
 

@@ -129,6 +129,7 @@ def test_a_wider_block_converges_where_a_narrow_one_does_not(monkeypatch: pytest
     widths = cut_short(monkeypatch, rounds=4, last_whole=0)
     graph = symmetric_graph(*KINDS["cliques"]())
     found = leading_eigenpairs(graph, COUNT, crowded_below=0)
+    assert found.miss == 0
     assert widths == [COUNT + 16, COUNT + 4 * 16, COUNT + 16 * 16]
     expected = torch.linalg.eigvalsh(laplacian(graph))[:COUNT]
     assert torch.allclose(found.values, expected, rtol=0, atol=2e-4)
@@ -145,6 +146,10 @@ def test_the_best_vectors_of_a_graph_too_large_are_orthonormal_and_near(
     width = found.vectors.shape[1]
     inner = found.vectors.T @ found.vectors
     assert torch.allclose(inner, torch.eye(width).double(), rtol=0, atol=1e-10)
+    # How far they are from being eigenvectors is told, where one of them is further than was asked for.
+    residual = laplacian(graph) @ found.vectors - found.values[:width] * found.vectors
+    assert found.miss == 0 or found.miss >= residual.norm(dim=0).max() - 1e-12
+    assert found.miss > 0 or residual.norm(dim=0).max() <= 1.1e-8
     # Ritz values are no smaller than the eigenvalues.
     expected = torch.linalg.eigvalsh(laplacian(graph))[:COUNT]
     assert bool((found.values >= expected - 1e-10).all())
@@ -162,6 +167,17 @@ def test_clusters_are_found_though_no_iteration_converges(
     found = cluster_graph(*graphs, config)
     assert len(widths) > 2
     assert torch.equal(found.label, expected.label)
+
+
+@pytest.mark.parametrize(("last_whole", "is_told"), [(0, True), (1 << 13, False)])
+def test_clusters_say_how_far_eigenpairs_are_from_their_tolerance(
+    last_whole: int, is_told: bool, monkeypatch: pytest.MonkeyPatch
+):
+    config = SpectralConfig(dense_limit=60, leading=COUNT, cut_below=1e-6)
+    cut_short(monkeypatch, rounds=1, last_whole=last_whole)
+    found = cluster_graph(*KINDS["scattered"](), config)
+    # One round of 500: eigenvalues err by hundredths.
+    assert found.miss > 1e-3 if is_told else found.miss == 0
 
 
 @pytest.mark.parametrize(
