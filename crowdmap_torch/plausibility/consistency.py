@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.special import ndtr, stdtrit
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
@@ -43,7 +44,7 @@ class ConsistencyLimits:
     least_lever_m: float = 0.6
     """Shorter levers are not named."""
     sure: float = 3.0
-    """Standard deviations that a lever has to exceed."""
+    """Standard deviations that a lever has to exceed; of few journeys as many as are as rare by Student's distribution."""
 
 
 _REWEIGHTINGS = 8
@@ -68,7 +69,7 @@ def consistency_findings(
     """Mistakes of all journeys under which their signs' rays do not meet."""
     limits = limits or ConsistencyLimits()
     given_px: list[float] = []
-    levers: list[Tensor] = []
+    levers: list[_Lever] = []
     tried: dict[str, list[float]] = {}
     findings: dict[str, Finding] = {}
     for journey, tracks in zip(journeys, tracklets, strict=True):
@@ -152,8 +153,18 @@ def _misfit(journey: Journey, rays: _Rays, shift: int, limits: ConsistencyLimits
     return float(angle[counted].median()) * rays.focal_px
 
 
-def _lever(journey: Journey, rays: _Rays) -> Float[Tensor, " 3"]:
-    """Where, in the camera's frame, the poses' positions are of, if not of the camera, by the rays' best meeting [m].
+@dataclass(frozen=True)
+class _Lever:
+    """Where, in the camera's frame, a journey's positions are of, if not of the camera."""
+
+    place: Float[Tensor, " 3"]
+    """By the rays' best meeting [m]."""
+    information: Float[Tensor, "3 3"]
+    """What its rays tell of it; what the poses' drift does to it is not in there."""
+
+
+def _lever(journey: Journey, rays: _Rays) -> _Lever:
+    """The lever under which the rays of a journey meet best.
 
     A lever moves all views of a straight drive alike; only where the car turns does it keep rays apart. Signs are
     eliminated, what is left are three unknowns.
@@ -164,7 +175,7 @@ def _lever(journey: Journey, rays: _Rays) -> Float[Tensor, " 3"]:
     ray = se3.rotate(T, rays.ray_camera)
     eye = torch.eye(3, dtype=ray.dtype, device=ray.device)
     across = eye - ray[:, :, None] * ray[:, None]
-    weight, lever = rays.closes.to(ray), ray.new_zeros(3)
+    weight, lever, information = rays.closes.to(ray), ray.new_zeros(3), eye
     for _ in range(_REWEIGHTINGS):
         origin = given - R @ lever
         point, _ = midpoint_ragged(origin, ray, views.sign, views.count, weight)
@@ -183,18 +194,23 @@ def _lever(journey: Journey, rays: _Rays) -> Float[Tensor, " 3"]:
         C = (R.mT @ by_point @ R).sum(0) - (B.mT @ solved[..., :3]).sum(0)
         rest = (R.mT @ at[..., None])[..., 0].sum(0) - (B.mT @ solved[..., 3:])[..., 0].sum(0)
         lever = torch.linalg.solve(C + 1e-9 * eye, rest)
-    return lever
+        information = C / usual.square()
+    return _Lever(lever, information)
 
 
-def _lever_findings(levers: Sequence[Tensor], limits: ConsistencyLimits) -> list[Finding]:
+def _lever_findings(levers: Sequence[_Lever], limits: ConsistencyLimits) -> list[Finding]:
     """Whether the journeys agree that positions are of another place on the car, ahead of the camera or behind it."""
-    if len(levers) < limits.least_journeys:
+    count = len(levers)
+    if count < limits.least_journeys:
         return []
-    ahead = torch.stack(list(levers))[:, 2]
-    usual = float(ahead.median())
-    # The median's own sigma, by the journeys' spread.
-    sigma = 1.86 * float((ahead - usual).abs().median()) / len(ahead) ** 0.5
-    if abs(usual) < max(limits.least_lever_m, limits.sure * sigma):
+    information = torch.stack([lever.information for lever in levers])
+    told = (information @ torch.stack([lever.place for lever in levers])[..., None])[..., 0]
+    # Of all journeys, and of all but one in turn: what drift does to each of them shows in how these differ (jackknife).
+    without = torch.linalg.solve(information.sum(0) - information, told.sum(0) - told)[:, 2]
+    usual = float(torch.linalg.solve(information.sum(0), told.sum(0))[2])
+    sigma = float((count - 1) ** 0.5 * without.std(correction=0))
+    as_rare = float(stdtrit(count - 1, ndtr(limits.sure)))
+    if abs(usual) < max(limits.least_lever_m, as_rare * sigma):
         return []
     where = "ahead of" if usual > 0 else "behind"
     return [

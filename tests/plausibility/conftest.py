@@ -14,14 +14,14 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.simulate.dataset import SimulationConfig, write_dataset
+from crowdmap_torch.simulate.errors import ALL, with_errors
 from crowdmap_torch.simulate.vehicle import VehicleConfig
 from crowdmap_torch.simulate.worlds import WORLD_PRESETS
 
 Look = Callable[[Path], dict[str, Finding]]
 
 
-@pytest.fixture(scope="session")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def winding_street() -> SimulationConfig:
     """Four drives of a winding street, by cameras with mounts and without."""
     street = WORLD_PRESETS["street"]
     world = replace(
@@ -31,9 +31,22 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
         signs=replace(street.signs, posts_per_km=60.0),
         road=replace(street.road, heading_deg=40.0, heading_wavelength_m=150.0),
     )
-    config = SimulationConfig(world=world, vehicle=VehicleConfig(frame_rate_hz=10.0), journeys=4)
+    return SimulationConfig(world=world, vehicle=VehicleConfig(frame_rate_hz=10.0), journeys=4)
+
+
+@pytest.fixture(scope="session")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Drives without a mistake, of vehicles that are as they say."""
     folder = tmp_path_factory.mktemp("plausibility") / "good"
-    write_dataset(config, folder)
+    write_dataset(winding_street(), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same by vehicles that have wrong what real ones have, twice as large."""
+    folder = tmp_path_factory.mktemp("plausibility") / "fleet"
+    write_dataset(with_errors(winding_street(), (ALL,), 2.0), folder)
     return folder
 
 

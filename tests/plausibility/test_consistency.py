@@ -9,7 +9,12 @@ from worlds.drives import make_journey
 
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.camera import Camera, project, unproject
-from crowdmap_torch.plausibility.consistency import ConsistencyLimits, consistency_findings
+from crowdmap_torch.plausibility.consistency import (
+    ConsistencyLimits,
+    _Lever,
+    _lever_findings,
+    consistency_findings,
+)
 from crowdmap_torch.tables import Journey, Rig, SignDetections, Tracklets
 
 K = torch.tensor([[800.0, 0, 639.5], [0, 800, 399.5], [0, 0, 1]]).double()
@@ -70,6 +75,19 @@ def test_a_lever_arm_is_named_with_its_length() -> None:
     (finding,) = found([drive(seed, lever=lever) for seed in range(5)])
     assert finding.kind == "lever-arm"
     assert "1.5 m behind" in finding.evidence
+
+
+def test_drives_that_contradict_each_other_show_no_lever_arm() -> None:
+    # Of six drives of a street, whose positions are of the camera: four of them nearly agree.
+    places = [0.94, -1.37, -1.80, -1.82, -0.15, 1.43]
+    known = torch.eye(3, dtype=torch.float64) / 0.3**2
+    scattered = [_Lever(known.new_tensor([0.0, 0.0, place]), known) for place in places]
+    assert _lever_findings(scattered, ConsistencyLimits()) == []
+    moved = [
+        replace(one, place=one.place / 10 - known.new_tensor([0, 0, 1.2])) for one in scattered
+    ]
+    (finding,) = _lever_findings(moved, ConsistencyLimits())
+    assert "1.2 m behind" in finding.evidence
 
 
 def test_few_drives_do_not_show_a_lever_arm() -> None:

@@ -17,6 +17,10 @@ def test_nothing_is_found_in_a_good_data_set(good: Path, look: Look) -> None:
     assert look(good) == {}
 
 
+def test_what_real_fleets_get_wrong_is_no_mistake(fleet: Path, look: Look) -> None:
+    assert look(fleet) == {}
+
+
 @pytest.mark.parametrize("name", ["kitti-00", "kitti-05", "kitti-06", "kitti-08"])
 def test_nothing_is_found_in_real_drives(
     real_data: Callable[[str], Path], look: Look, name: str
