@@ -28,6 +28,7 @@ class Outcome:
     code: int
     """Its exit code; below zero the signal that ended it."""
     seconds: float
+    """How long it took, its waiting for a processor that others used left out."""
     resident_bytes: int
     """The most that it held."""
     out: str
@@ -40,7 +41,7 @@ class Child:
     def __init__(self, main: Callable[[], int], folder: Path) -> None:
         self._folder = folder
         (folder / "cwd").mkdir(exist_ok=True)
-        self._begun = time.monotonic()
+        self._begun, self._waited = time.monotonic(), 0.0
         self.pid = os.fork()
         if self.pid == 0:
             _become(main, folder)
@@ -49,11 +50,12 @@ class Child:
     def has_ended(self) -> bool:
         """Whether it has; asking costs next to nothing."""
         if self._outcome is None:
+            self._waited = _waited_for_processor(self.pid)
             ended, status, usage = os.wait4(self.pid, os.WNOHANG)
             if ended:
                 self._outcome = Outcome(
                     code=os.waitstatus_to_exitcode(status),
-                    seconds=time.monotonic() - self._begun,
+                    seconds=self._taken(),
                     resident_bytes=usage.ru_maxrss * 1024,
                     out=(self._folder / "out.txt").read_text("utf-8", "replace"),
                     err=(self._folder / "err.txt").read_text("utf-8", "replace"),
@@ -61,20 +63,31 @@ class Child:
         return self._outcome is not None
 
     def outcome(self, *, seconds: float = SECONDS) -> Outcome:
-        """Waits for its end; it is killed so many seconds after its beginning."""
+        """Waits for its end; it is killed when it has taken so many seconds."""
         pause = 0.002
         while not self.has_ended():
-            if time.monotonic() - self._begun > seconds:
+            if self._taken() > seconds:
                 os.kill(self.pid, signal.SIGKILL)
             time.sleep(pause)
             pause = min(2 * pause, 0.05)
         assert self._outcome is not None
         return self._outcome
 
+    def _taken(self) -> float:
+        return time.monotonic() - self._begun - self._waited
+
 
 def run_apart(main: Callable[[], int], folder: Path, *, seconds: float = SECONDS) -> Outcome:
     """What came of `main` in a `Child`."""
     return Child(main, folder).outcome(seconds=seconds)
+
+
+def _waited_for_processor(process: int) -> float:
+    """How long a process could have run while others did [s]; 0 where the kernel does not tell."""
+    try:
+        return float(Path(f"/proc/{process}/schedstat").read_text().split()[1]) * 1e-9
+    except OSError:
+        return 0.0
 
 
 def children(process: int) -> list[int]:

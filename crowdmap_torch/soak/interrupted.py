@@ -167,12 +167,12 @@ def _write(folder: Path, counts: Sequence[int]) -> _Street:
     for workers in counts:
         place = folder / f"workers-{workers}"
         place.mkdir()
-        begun = time.monotonic()
         outcome = Child(_main(street, place, workers), place).outcome(seconds=_PATIENCE_S)
+        ended = time.monotonic()
         differ = differences(whole, place / "run")
         if outcome.code or differ:
             raise RuntimeError(f"a run with {workers} workers is another one: {outcome} {differ}")
-        times = [*_reached(place / "course").values(), begun + outcome.seconds]
+        times = [*_reached(place / "course").values(), ended]
         for stage, (reached, left) in zip(STAGES, pairwise(times), strict=True):
             seconds[workers, stage] = left - reached
     return replace(street, seconds=seconds)

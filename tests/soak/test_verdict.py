@@ -52,6 +52,9 @@ def test_tracebacks_time_and_memory_are_seen(
     assert any("traceback: ZeroDivisionError" in p for p in ended(lambda: 1 // 0, tmp_path))
     late = ended(lambda: time.sleep(60) or 0, tmp_path, seconds=0.2)
     assert any("exit code -9" in problem for problem in late)
+    # What it did not get to run for, because others did, is not its own.
+    monkeypatch.setattr(child, "_waited_for_processor", lambda pid: 1000.0)
+    assert run_apart(lambda: time.sleep(0.4) or 0, tmp_path, seconds=0.2).seconds < 0
     monkeypatch.setattr(verdict, "RESIDENT_BYTES", 1)
     assert any(problem.endswith(" MB") for problem in ended(refuses, tmp_path))
 
