@@ -16,6 +16,12 @@ from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
 from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
 from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
+from crowdmap_torch.adjustment.shared_corner_errors import (
+    CornerDetections,
+    corner_detections,
+    lasting_variance,
+    shared_errors,
+)
 from crowdmap_torch.geometry import se3, spline_basis
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
@@ -47,6 +53,8 @@ _NARROWS = 0.97
 """A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
 _SCALE_RESTS = 0.005
 """A scale of the prior that would change by less than this share is at rest."""
+_LASTING_RESTS = 0.1
+"""The variance of a detection's shift that would change by less than this share is at rest."""
 
 
 VARIABLES = {
@@ -78,6 +86,8 @@ class Bundle(nn.Module):
     that of lane points, as those of one detection err together."""
     small_box: Tensor
     """Box [px] at which a corner's standard deviation is 1.41 times that of a large box."""
+    lasting: Tensor
+    """Variance [px^2] of a detection's shift, in the mean of many successive ones, beyond its corners' noise."""
     judged: Tensor
     """How often detections were judged by everything else."""
     given_up: Tensor
@@ -103,6 +113,7 @@ class Bundle(nn.Module):
             self.register_parameter(f"delta_{name}", nn.Parameter(increment))
         self.register_buffer("scale", values["pose"].new_full((3,), torch.inf))
         self.register_buffer("small_box", torch.zeros_like(self.scale[0]))
+        self.register_buffer("lasting", torch.zeros_like(self.scale[0]))
         last = int(corners.detection.max()) + 1 if len(corners) else 0
         given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
         self.register_buffer("given_up", given_up)
@@ -126,6 +137,7 @@ class Bundle(nn.Module):
             ByOptics.none(len(rows), self.fleet.config, rows.px, heights)
             for rows, heights in ((self.corners, 0), (self.lane_points, 1))
         )
+        self._detections = (self.corners.detection, corner_detections(self.corners))
         self._plan = self._elimination()
 
     @torch.no_grad()
@@ -189,7 +201,8 @@ class Bundle(nn.Module):
         """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
 
         The scales of pixels start at what the residuals show, so that a wrong start does not make outliers of
-        everything, and fall as the fit improves; they never grow again. Those of the poses' prior follow the drift.
+        everything, and fall as the fit improves; they never grow again. What detections of a sign have wrong together is
+        told from zero on once they are at rest: before that it is the drift. Those of the poses' prior follow the drift.
         """
         values = self.values()
         if len(self.lane_points):
@@ -263,7 +276,18 @@ class Bundle(nn.Module):
         narrows = seen < _NARROWS * self.scale
         self.scale.copy_(torch.where(narrows, seen, self.scale))
         self.small_box.copy_(torch.where(narrows[0], small_box, self.small_box))
-        return not bool(narrows.any())
+        return not bool(narrows.any()) and self._lasts(of_corners)
+
+    def _lasts(self, of_corners: Float[Tensor, "m 2"]) -> bool:
+        """Finds what lasts of detections' shifts; returns whether it has come to rest."""
+        if not len(of_corners) or self.config.method == "paper2017":
+            return True
+        sigma, counted = self.corner_sigma(), ~self.given_up[self.corners.detection]
+        seen = lasting_variance(self._corner_detections(), of_corners, sigma, counted)
+        white = self.scale[0].square() / self._corner_detections().most
+        rests = (seen - self.lasting).abs() <= _LASTING_RESTS * (seen + white)
+        self.lasting.copy_(torch.where(rests, self.lasting, seen))
+        return bool(rests)
 
     def problem(self) -> Problem:
         """The least-squares problem with the matches and scales of the moment, lanes held where they are.
@@ -322,7 +346,17 @@ class Bundle(nn.Module):
             loss,
             reprojection.sign_reprojection_jacobian,
         )
+        if isinstance(sigma, Tensor) and bool(self.lasting > 0):
+            term = replace(
+                term, shared=shared_errors(self._corner_detections(), sigma, self.lasting)
+            )
         return {"sign_reprojection": self.fleet.of_corners(term, rows, self._by_optics[0])}
+
+    def _corner_detections(self) -> CornerDetections:
+        """The detections of the corners, told apart anew where the corners are others."""
+        if self._detections[0] is not self.corners.detection:
+            self._detections = (self.corners.detection, corner_detections(self.corners))
+        return self._detections[1]
 
     def _loss_of_detections(self) -> JointTukey:
         """The loss of whole detections, those that are given up of no account."""

@@ -26,6 +26,7 @@ class CornerObservations(SeenPoints):
 
     detection: Int[Tensor, " m"]
     """Sign detection, counted over all journeys, twice: the centre of a box is one of its own."""
+    journey: Int[Tensor, " m"]
     sign: Int[Tensor, " m"]
     template: Float[Tensor, "m 2"]
     """The corner for width and height one, on the sign's plane."""
@@ -73,9 +74,9 @@ def corner_observations(
     begins = accumulate((len(journey.signs) for journey in journeys), initial=0)
     return concatenate(
         [
-            _corners(journey, lens, association, signs, offset, detections, box_sigma)
-            for journey, lens, association, offset, detections in zip(
-                journeys, lenses, associations, offsets, begins, strict=False
+            _corners(journey, number, lens, association, signs, offset, detections, box_sigma)
+            for number, (journey, lens, association, offset, detections) in enumerate(
+                zip(journeys, lenses, associations, offsets, begins, strict=False)
             )
         ]
     )
@@ -83,6 +84,7 @@ def corner_observations(
 
 def _corners(
     journey: Journey,
+    number: int,
     lens: int,
     association: Association,
     signs: Signs,
@@ -90,7 +92,7 @@ def _corners(
     before: int,
     box_sigma: float,
 ) -> CornerObservations:
-    """The rows of one journey, with `offset` frames and `before` detections before it."""
+    """The rows of one journey, the `number`-th, with `offset` frames and `before` detections before it."""
     detections = journey.signs
     used = torch.nonzero(association.sign >= 0)[:, 0]
     used = used[detections.shape[used] == signs.shape[association.sign[used]]]
@@ -121,9 +123,11 @@ def _corners(
     template = torch.cat((template[row, corner], mean(template)))
     loose = torch.zeros_like(box[of])
     loose[: len(row)] = box_sigma / 2 * box[row] * boxed[row]
+    frame = detections.frame[used][of]
     return CornerObservations(
         **seen_points(journey.rig.camera, lens, px, ideal),
-        frame=detections.frame[used][of] + offset,
+        frame=frame + offset,
+        journey=torch.full_like(frame, number),
         detection=2 * (used[of] + before) + (torch.arange(len(of), device=of.device) >= len(row)),
         sign=sign[of],
         template=template,

@@ -34,16 +34,18 @@ def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
         constants=tuple(constant[index] for constant in term.constants),
         weight=None if term.weight is None else term.weight[index],
         loss=term.loss.of_rows(index) if isinstance(term.loss, JointLoss) else term.loss,
+        shared=None if term.shared is None else term.shared.of_rows(index),
     )
 
 
 def chunks(term: CostTerm, size: int = CHUNK_ROWS) -> Iterator[tuple[slice, CostTerm]]:
-    """The term in pieces of at most `size` rows; those that a loss joins stay in one piece, however many they are."""
+    """The term in pieces of at most `size` rows; those that are joined stay in one piece, however many they are."""
+    joint = term.loss if isinstance(term.loss, JointLoss) else term.shared
     start = 0
     while start < len(term):
         stop = min(start + size, len(term))
-        if isinstance(term.loss, JointLoss):
-            stop = term.loss.cut(start, stop)
+        if joint is not None:
+            stop = joint.cut(start, stop)
         piece = slice(start, stop)
         yield piece, rows(term, piece)
         start = stop
@@ -54,6 +56,8 @@ def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:
     if not len(term):
         return torch.zeros(0, 1, dtype=next(iter(values.values())).dtype)
     residual = _evaluate(term, _arguments(term, values))
+    if term.shared is not None:
+        residual = term.shared.whiten(residual)
     return (residual if term.weight is None else residual * _scale(term.weight)).mT.contiguous()
 
 
@@ -185,11 +189,16 @@ def _weighted(
 def _jacobians(
     term: CostTerm, variables: Mapping[str, Variable], values: Values
 ) -> tuple[Float[Tensor, "d m"], tuple[Jacobian, ...]]:
-    """Residuals and one Jacobian per slot, not whitened, in the term's closed form or by autograd."""
+    """Residuals and one Jacobian per slot, in the term's closed form or by autograd; not yet whitened by its weights."""
     if term.jacobian is None:
-        return autograd_jacobians(term, variables, values)
-    residual, jacobians = term.jacobian(*_arguments(term, values))
-    return residual, jacobians[: len(term.slots)]
+        residual, jacobians = autograd_jacobians(term, variables, values)
+    else:
+        residual, jacobians = term.jacobian(*_arguments(term, values))
+    jacobians = jacobians[: len(term.slots)]
+    if term.shared is None:
+        return residual, jacobians
+    whiten = term.shared.whiten
+    return whiten(residual), tuple(whiten(J) for J in dense(jacobians))
 
 
 def autograd_jacobians(

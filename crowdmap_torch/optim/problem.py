@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.robust import Loss, Quadratic
+from crowdmap_torch.optim.shared_errors import SharedErrors
 
 Values = Mapping[str, Tensor]
 """The value of every block of every variable, by name; blocks are the leading axis."""
@@ -93,6 +94,9 @@ class CostTerm:
     """
     takes_rows: bool = False
     """Whether `residual` serves many rows at once, their number its last axis."""
+    shared: SharedErrors | None = None
+    """What rows have wrong together; None: each errs for itself. The `weight` of such rows is the same, and their loss one
+    of them together."""
 
     def by_autograd(self) -> CostTerm:
         """The same term without its closed form."""

@@ -12,6 +12,8 @@ from scipy.optimize import root_scalar
 from scipy.special import gammainc
 from torch import Tensor
 
+from crowdmap_torch.optim.shared_errors import cut_between_runs
+
 _EFFICIENCY = 0.95
 """Of Tukey's weights at normal residuals with the usual c of 4.685 (Holland and Welsch 1977)."""
 
@@ -154,13 +156,7 @@ class JointTukey:
 
     def cut(self, start: int, stop: int) -> int:
         """The last beginning of a detection behind `start` and up to `stop`, or else the first behind that."""
-        rows = len(self.run)
-        if stop >= rows:
-            return rows
-        begins = int(torch.searchsorted(self.run, self.run[stop]))
-        if begins > start:
-            return begins
-        return int(torch.searchsorted(self.run, self.run[stop], right=True))
+        return cut_between_runs(self.run, start, stop)
 
     def _together(self, s: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
         """The sum over each row's detection."""

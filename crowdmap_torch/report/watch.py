@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -109,8 +110,9 @@ class Watch:
             self._log.log_histogram(f"weight/{name}", weight, number + 1)
         self._log.log_iteration(iteration, down_weighted=down_weighted)
         names = ("sign_px", "lane_px", "lane_correlation")
-        scales = dict(zip(names, bundle.scale.tolist(), strict=True))
-        self._log.log_scalars({f"scale/{k}": v for k, v in scales.items()}, number + 1)
+        scales = {f"scale/{k}": v for k, v in zip(names, bundle.scale.tolist(), strict=True)}
+        scales["scale/lasting_px"] = math.sqrt(float(bundle.lasting))
+        self._log.log_scalars(scales, number + 1)
         self._log.log_scalars(dict(_calibration_scalars(bundle)), number + 1)
         if len(bundle.corners):
             given_up = bundle.given_up[bundle.corners.detection].double().mean()
@@ -145,6 +147,7 @@ def corner_residuals(bundle: Bundle) -> Float[Tensor, "m 2"]:
     term = bundle.problem().terms.get("sign_reprojection")
     if term is None or not len(term):
         return torch.zeros(0, 2, dtype=bundle.scale.dtype)
+    term = replace(term, shared=None)
     return (residuals(term, bundle.values()) * bundle.corner_sigma()[:, None]).cpu()
 
 

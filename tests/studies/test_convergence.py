@@ -19,7 +19,7 @@ def corners() -> CornerObservations:
     detection = 2 * (torch.arange(rows) // 4)
     matrix = torch.eye(3, dtype=torch.float64).repeat(rows, 1, 1)
     others = {f.name: torch.zeros(rows, dtype=torch.float64) for f in fields(CornerObservations)}
-    others |= {"frame": detection, "sign": detection, "lens": detection}
+    others |= dict.fromkeys(("frame", "sign", "lens", "journey"), detection)
     others |= {name: torch.zeros(rows, 2).double() for name in ("template", "px", "ideal", "bend")}
     return CornerObservations(**{**others, "detection": detection, "matrix": matrix})
 

@@ -1,0 +1,102 @@
+"""How much of what a detection's corners have wrong together lasts from one detection to the next."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from crowdmap_torch.adjustment.observations import CornerObservations
+from crowdmap_torch.adjustment.shared_corner_errors import (
+    corner_detections,
+    lasting_variance,
+    shared_errors,
+)
+
+F64 = torch.float64
+_VIEWS, _SIGNS, _JOURNEYS, _CORNERS = 60, 5, 6, 4
+
+
+def rows() -> CornerObservations:
+    """Detections of four corners: in every frame of a journey all signs, one after the other."""
+    count = _JOURNEYS * _VIEWS * _SIGNS
+    detection = torch.arange(count).repeat_interleave(_CORNERS)
+    frame = torch.arange(_JOURNEYS * _VIEWS).repeat_interleave(_SIGNS * _CORNERS)
+    sign = torch.arange(_SIGNS).repeat_interleave(_CORNERS).repeat(_JOURNEYS * _VIEWS)
+    m = len(detection)
+    zero = torch.zeros(m, dtype=F64)
+    return CornerObservations(
+        frame=frame,
+        lens=torch.zeros_like(frame),
+        px=torch.zeros(m, 2, dtype=F64),
+        ideal=torch.zeros(m, 2, dtype=F64),
+        bend=torch.zeros(m, 2, dtype=F64),
+        matrix=torch.zeros(m, 3, 3, dtype=F64),
+        detection=2 * detection,
+        journey=frame // _VIEWS,
+        sign=sign,
+        template=torch.zeros(m, 2, dtype=F64),
+        box_px=zero,
+        loose_px=zero,
+    )
+
+
+def errors(shift: float, lasts: float, seed: int) -> Tensor:
+    """Corners' noise of half a pixel, and shifts of which the share `lasts` is still there a frame later."""
+    g = torch.Generator().manual_seed(seed)
+    push = torch.randn(_JOURNEYS, _VIEWS, _SIGNS, 2, generator=g, dtype=F64)
+    for view in range(1, _VIEWS):
+        push[:, view] = lasts * push[:, view - 1] + (1 - lasts**2) ** 0.5 * push[:, view]
+    together = shift * push.reshape(-1, 2).repeat_interleave(_CORNERS, 0)
+    return together + 0.5 * torch.randn(len(together), 2, generator=g, dtype=F64)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("shift", "lasts"), [(0.0, 0.0), (0.7, 0.0), (0.7, 0.8)])
+def test_what_lasts_is_the_variance_of_long_means(shift: float, lasts: float, seed: int):
+    table = rows()
+    sigma = torch.full((len(table),), 0.5, dtype=F64)
+    counted = torch.ones(len(table), dtype=torch.bool)
+    found = lasting_variance(corner_detections(table), errors(shift, lasts, seed), sigma, counted)
+    expected = shift**2 * (1 + lasts) / (1 - lasts)
+    assert abs(float(found) - expected) < 0.25 * expected + 0.03
+
+
+def test_outliers_and_what_is_given_up_do_not_matter():
+    table, error = rows(), errors(0.0, 0.0, 0)
+    sigma = torch.full((len(table),), 0.5, dtype=F64)
+    wild = table.detection % 40 == 0
+    error[wild] += 30.0
+    for counted in (~wild, torch.ones_like(wild)):
+        found = lasting_variance(corner_detections(table), error, sigma, counted)
+        assert float(found) < 0.15
+
+
+def test_detections_of_other_signs_drives_and_kinds_do_not_follow_each_other():
+    table = rows()
+    first = corner_detections(table)
+    follower = first.follower
+    count = len(follower)
+    expected = torch.arange(count) + _SIGNS
+    expected[torch.arange(count) // _SIGNS % _VIEWS == _VIEWS - 1] = -1
+    assert (follower == expected).all()
+    # The centres of boxes, of odd numbers, are detections beside those of their corners.
+    both = replace(table, detection=table.detection + (torch.arange(len(table)) % 4 == 3))
+    twice = corner_detections(both)
+    assert (twice.count[::2] == 3).all() and (twice.count[1::2] == 1).all()
+    used = twice.follower >= 0
+    assert (twice.follower[used] % 2 == torch.nonzero(used)[:, 0] % 2).all()
+
+
+def test_what_lasts_takes_off_the_say_of_the_mean_alone():
+    table = rows()
+    found = corner_detections(table)
+    sigma = torch.full((len(table),), 0.5, dtype=F64)
+    shared = shared_errors(found, sigma, torch.tensor(3.0, dtype=F64))
+    shift = torch.ones(2, len(table), dtype=F64)
+    expected = (1 + _CORNERS * 3.0 / 0.25) ** -0.5
+    torch.testing.assert_close(shared.whiten(shift), expected * shift)
+    sides = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=F64).repeat(len(table) // 4).expand(2, -1)
+    torch.testing.assert_close(shared.whiten(sides), sides)
