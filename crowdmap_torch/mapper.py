@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
@@ -30,6 +30,7 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     with_evidence,
 )
 from crowdmap_torch.crowd_signs.gather import gather_signs
+from crowdmap_torch.crowd_signs.outages import outside_outages
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.trajectory import station
@@ -244,9 +245,9 @@ def first_map(
         rounds = clusters.rounds
     else:
         # Bad drives leave nothing behind: where they are off is not known well enough to move their pieces.
-        trusted = (crowd.journey_weight > 0).tolist()
+        trusted = trusted_frames(journeys, crowd)
         moved = [
-            unbiased_lanes(pieces if is_good else pieces.select(pieces.journey[:0]), drift)
+            unbiased_lanes(pieces.select(torch.nonzero(is_good[pieces.frame])[:, 0]), drift)
             for pieces, drift, is_good in zip(made, drifts, trusted, strict=True)
         ]
         joined = join_lanes(concatenate_lanes(moved), config.positioning, config.lane_join)
@@ -261,6 +262,15 @@ def first_map(
         associations=found.associations,
         drifts=drifts,
         completed=found.completed,
+    )
+
+
+def trusted_frames(journeys: Sequence[Journey], crowd: Crowd) -> tuple[Bool[Tensor, " _"], ...]:
+    """By journey the frames that have a say: all but those of bad drives, and of outages of positioning."""
+    outages = crowd.report.outages
+    return tuple(
+        outside_outages(station(journey.T_world_camera), number, outages) & (weight > 0)
+        for number, (journey, weight) in enumerate(zip(journeys, crowd.journey_weight, strict=True))
     )
 
 
@@ -290,7 +300,7 @@ def build_bundle(
         config.adjust,
         lane_tracklets=[m.lane_tracklets for m in maps],
         lane_support=first.lane_support,
-        left_out=[outlier.journey for outlier in first.crowd.report.outlier_journeys],
+        trusted=trusted_frames(journeys, first.crowd),
         calibration=config.calibration,
         known_cars=known_cars,
         control=None

@@ -8,7 +8,7 @@ all that the next ones follow from; a bundle that is built alike goes on from th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -64,22 +64,22 @@ def build(
     *,
     lane_tracklets: Sequence[Tracklets] = (),
     lane_support: LaneSupport | None = None,
-    left_out: Collection[int] = (),
+    trusted: Sequence[Bool[Tensor, " _"]] | None = None,
     control: ControlSigns | None = None,
     calibration: CalibrationConfig | None = None,
     known_cars: Mapping[str, KnownCalibration] | None = None,
 ) -> Bundle:
     """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
 
-    `drifts` are tangents per frame, from the positioning module's pose to the start pose. Journeys `left_out`, by
-    number, have no say. Signs that are `control` points are held where they were surveyed. Lane points keep the lane that
-    `lane_support` has for the journeys' `lane_tracklets` there, where it has one; others go to the nearest lane. What cars
-    may have wrong `calibration` says, None: nothing; and what is known of some of them `known_cars`.
+    `drifts` are tangents per frame, from the positioning module's pose to the start pose. Frames that are not
+    `trusted`, by journey, have no say. Signs that are `control` points are held where they were surveyed. Lane points
+    keep the lane that `lane_support` has for the journeys' `lane_tracklets` there, where it has one; others go to the
+    nearest lane. What cars may have wrong `calibration` says, None: nothing; and what is known of some of them
+    `known_cars`.
     """
     given = torch.cat([journey.T_world_camera for journey in journeys])
     drift = torch.cat(list(drifts))
     start = se3.retract(given, drift)
-    trusted = _trusted_frames(journeys, left_out)
     corners = corner_observations(journeys, associations, signs, box_sigma=config.box_sigma)
     points, ground = _points_on_ground(journeys, roads, start, config)
     known = None
@@ -88,7 +88,8 @@ def build(
     points, matches = _matched(points, ground, lanes, known, config)
     observed = Observations(corners, points, matches, lenses_of(journeys)[0])
     every = torch.arange(len(given), device=given.device)
-    observed = observed.renumbered(torch.where(trusted, every, -1))
+    if trusted is not None:
+        observed = observed.renumbered(torch.where(torch.cat(list(trusted)), every, -1))
     kept = _kept_frames(journeys, observed, config)
     observed = observed.renumbered(torch.where(kept, kept.cumsum(0) - 1, -1))
     frame = torch.nonzero(kept)[:, 0]
@@ -112,16 +113,6 @@ def build(
     fixed = _fixed_terms(values, signs, lanes, observed.corners, control, config)
     priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet)
     return Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
-
-
-def _trusted_frames(journeys: Sequence[Journey], left_out: Collection[int]) -> Bool[Tensor, " f"]:
-    """False for the frames of journeys that have no say."""
-    return torch.cat(
-        [
-            torch.full_like(journey.t_ns, number not in left_out, dtype=torch.bool)
-            for number, journey in enumerate(journeys)
-        ]
-    )
 
 
 def _kept_frames(

@@ -127,8 +127,9 @@ def associate_detections(
     trusted = crowd.journey_weight > 0
     heads = with_evidence(heads, journeys, associations, trusted, completion)
     sure = existence(heads.n_journeys, passing, config.existence)
-    # What a bad drive alone saw is nothing to look for.
-    tentative = crowd.tentative[trusted[crowd.tentative.journey]]
+    # What a bad drive alone saw, or one where its positions were off, is nothing to look for.
+    sound = trusted[crowd.tentative.journey] & ~crowd.displaced[crowd.label < 0]
+    tentative = crowd.tentative[sound]
     tentative = tentative[still_alone(tentative, tracklets, associations)]
     heads = replace(heads, confidence=sure.to(heads.size))
     return AssociatedSigns(heads, tentative, associations, completed)

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import distinct_pairs
 from crowdmap_torch.clustering.spectral import renumber
 from crowdmap_torch.crowd_signs.align import (
     AlignConfig,
@@ -53,6 +52,7 @@ from crowdmap_torch.crowd_signs.merge import (
     join_passes,
     merge_heads,
 )
+from crowdmap_torch.crowd_signs.outages import Outage, OutageConfig, displaced_by, find_outages
 from crowdmap_torch.crowd_signs.outlier_journeys import (
     JourneyStatistics,
     OutlierJourney,
@@ -60,6 +60,7 @@ from crowdmap_torch.crowd_signs.outlier_journeys import (
     find_outlier_journeys,
     journey_statistics,
 )
+from crowdmap_torch.crowd_signs.rounds import CrowdRound, crowd_round
 from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.ranges import FILLED, Count, Rounds, Settings, Share, Sigma, Spacing
@@ -105,25 +106,14 @@ class CrowdConfig(Settings):
     """Confidence in signs."""
     outlier_journeys: OutlierJourneyConfig = field(default_factory=OutlierJourneyConfig)
     """Drives that do not fit the crowd."""
+    outages: OutageConfig = field(default_factory=OutageConfig)
+    """Stretches of drives that do not fit it."""
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
         super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
-
-
-@dataclass(frozen=True)
-class CrowdRound:
-    """One alternation of clustering and alignment."""
-
-    shift_sigma: float
-    """Uncertainty of the journeys' shifts that it assumed [m]; 0 with `paper2017`."""
-    clusters: int
-    singles: int
-    """Signs in no cluster."""
-    changed: int
-    """Signs that left the cluster most of their companions are in, or came to it."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +126,8 @@ class CrowdReport:
     statistics: JourneyStatistics
     outlier_journeys: tuple[OutlierJourney, ...]
     """Drives that do not fit the crowd."""
+    outages: tuple[Outage, ...]
+    """Stretches of drives that do not fit it."""
     n_passing: Int[Tensor, " c"]
     """Journeys that passed by each sign."""
 
@@ -157,6 +149,8 @@ class Crowd:
     share.
     """
     bias: JourneyBias
+    displaced: Bool[Tensor, " n"]
+    """Members that are signs of the others, beside their places."""
     journey_weight: Float[Tensor, " j"]
     """1; 0 for bad drives, which had no say in the heads and biases of others."""
     report: CrowdReport
@@ -209,7 +203,7 @@ def _register_paper(
         unbiased, label, heads, company, bias.translation, drift, crowd.leap
     )
     weight = crowd.bias_sigma.new_ones(crowd.journeys)
-    rounds = [_round(0.0, torch.full_like(label, -1), label)]
+    rounds = [crowd_round(0.0, torch.full_like(label, -1), label)]
     made = _finished(
         crowd,
         label,
@@ -261,7 +255,7 @@ def _register_joint(
                 generator,
             )
             spectra = spectra or spectrum
-            rounds.append(_round(shift_sigma, before, label))
+            rounds.append(crowd_round(shift_sigma, before, label))
             bias = align_journeys(
                 with_covariance(signs, extra),
                 label,
@@ -289,7 +283,9 @@ def _register_joint(
     assert statistics is not None
     unbiased = with_covariance(unbiased_signs(crowd, bias), extra)
     label = _consolidated(crowd, unbiased, label, weight[signs.journey], config)
-    heads = sign_heads(unbiased, label, weight=weight[signs.journey])
+    label, heads, outages, displaced = _without_outages(
+        crowd, unbiased, label, weight[signs.journey], config
+    )
     return _finished(
         crowd,
         label,
@@ -302,6 +298,8 @@ def _register_joint(
         statistics,
         positioning,
         config,
+        outages=outages,
+        displaced=displaced,
     )
 
 
@@ -373,19 +371,24 @@ def _consolidated(
     return join_leftovers(unbiased, label, heads, together, config.match)
 
 
-def _round(shift_sigma: float, before: Int[Tensor, " n"], after: Int[Tensor, " n"]) -> CrowdRound:
-    now, then, size = distinct_pairs(after, before)
-    clusters = int(after.max()) + 1 if len(after) else 0
-    # Of the members of each cluster, those that were together before; a label of -1 was no company.
-    together = (now >= 0) == (then >= 0)
-    main = size.new_zeros(clusters + 1)
-    main = main.scatter_reduce(0, now[together] + 1, size[together], "amax")
-    return CrowdRound(
-        shift_sigma=shift_sigma,
-        clusters=clusters,
-        singles=int((after < 0).sum()),
-        changed=len(after) - int(main.sum()),
-    )
+def _without_outages(
+    crowd: CrowdSigns,
+    unbiased: Signs,
+    label: Int[Tensor, " n"],
+    weight: Float[Tensor, " n"],
+    config: CrowdConfig,
+) -> tuple[Int[Tensor, " n"], Signs, tuple[Outage, ...], Bool[Tensor, " n"]]:
+    """Labels and heads without signs that outages displaced, the outages, and which signs those are."""
+    heads = sign_heads(unbiased, label, weight=weight)
+    # Bad drives have no say anywhere.
+    say, like = weight > 0, config.match.similarity
+    away = displaced_by(unbiased, label, heads, say, like, config.outages)
+    outages = find_outages(unbiased, crowd.station, label, heads, away, config.outages)
+    if outages:
+        least, label = min(config.min_journeys, crowd.journeys), label.masked_fill(away > 0, -1)
+        label = without_small(crowd.signs.journey, label, min_journeys=least, counts=say)
+        heads = sign_heads(unbiased, label, weight=weight)
+    return label, heads, outages, away > 0
 
 
 def _finished(
@@ -400,6 +403,9 @@ def _finished(
     statistics: JourneyStatistics,
     positioning: PositioningNoise,
     config: CrowdConfig,
+    *,
+    outages: tuple[Outage, ...] = (),
+    displaced: Bool[Tensor, " n"] | None = None,
 ) -> Crowd:
     passing = passing_journeys(crowd, label, len(heads), config.existence)
     confidence = existence(heads.n_journeys, passing, config.existence).to(heads.size)
@@ -415,12 +421,14 @@ def _finished(
         heads=replace(heads, confidence=confidence),
         tentative=replace(tentative, confidence=torch.minimum(low, tentative.confidence)),
         bias=bias,
+        displaced=torch.zeros_like(label, dtype=torch.bool) if displaced is None else displaced,
         journey_weight=weight,
         report=CrowdReport(
             rounds=tuple(rounds),
             spectra=spectra,
             statistics=statistics,
             outlier_journeys=outliers,
+            outages=outages,
             n_passing=passing,
         ),
     )

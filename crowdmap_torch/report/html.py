@@ -101,6 +101,7 @@ def _journeys(record: RunRecord) -> str:
     named = [
         *(("set aside", r) for r in record.rejected),
         *(("outlier", r) for r in record.outlier_journeys),
+        *(("outage", r) for r in record.outages),
     ]
     warning = ""
     if named:
@@ -108,7 +109,9 @@ def _journeys(record: RunRecord) -> str:
         warning = (
             '<div class="box warn">' + simple_table(("", "journey", "reason"), rows) + "</div>"
         )
-        warning = "<h3>Journeys set aside or without weight</h3>" + warning
+        warning = (
+            "<h3>Journeys set aside, or without weight on all or some of their way</h3>" + warning
+        )
     if not record.journeys:
         return warning
     return (

@@ -21,9 +21,11 @@ from crowdmap_torch.report.plots import Eigengap
 from crowdmap_torch.report.stages import eigengaps_of
 from crowdmap_torch.report.summaries import (
     JourneySummary,
+    OutageSummary,
     Pruned,
     counts_of,
     journey_summaries,
+    outages_of,
     outlier_journeys_of,
     pruned_of,
 )
@@ -55,6 +57,7 @@ class RunRecord:
     rejected: tuple[RejectedJourney, ...] = ()
     """Journeys set aside at the door."""
     outlier_journeys: tuple[RejectedJourney, ...] = ()
+    outages: tuple[OutageSummary, ...] = ()
     """Journeys that lost their weight."""
     calibration: FleetCalibration = field(default_factory=dict)
     """What cars have wrong for good."""
@@ -113,6 +116,7 @@ def record_of(
         calibration=result.uncertainty.calibration,
         rejected=dataset.rejected,
         outlier_journeys=outlier_journeys_of(dataset, result.first),
+        outages=outages_of(dataset, result.first),
         spectra=eigengaps_of(result.first),
         residual_px=watch.residual_px,
         iterations=tuple(watch.iterations),

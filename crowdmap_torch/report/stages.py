@@ -11,7 +11,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_count
 from crowdmap_torch.mapper import FirstMap, JourneyMap
 from crowdmap_torch.report.plots import Eigengap, plot_eigengaps
-from crowdmap_torch.report.summaries import outlier_journeys_of
+from crowdmap_torch.report.summaries import outages_of, outlier_journeys_of
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.tables import Dataset, Journey, Tracklets
 
@@ -70,7 +70,7 @@ def log_crowd(log: TensorBoardLog, dataset: Dataset, first: FirstMap) -> None:
         # As in metrics.json: what is to be added to the given positions, in the mean along the way.
         bias = dict(zip(("east", "north", "up"), drift[:, :3].mean(0).tolist(), strict=True))
         log.log_scalars({f"bias/{axis}_m": value for axis, value in bias.items()}, number)
-    bad = (*dataset.rejected, *outlier_journeys_of(dataset, first))
+    bad = (*dataset.rejected, *outlier_journeys_of(dataset, first), *outages_of(dataset, first))
     log.log_text("bad_drives", "\n".join(f"{j.journey_id}: {j.reason}" for j in bad) or "none")
 
 

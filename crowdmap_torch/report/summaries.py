@@ -53,6 +53,31 @@ def outlier_journeys_of(dataset: Dataset, first: FirstMap) -> tuple[RejectedJour
     )
 
 
+@dataclass(frozen=True)
+class OutageSummary:
+    """A stretch of a journey that had no say, as its positions were off there."""
+
+    journey_id: str
+    from_m: float
+    """Way driven where it begins."""
+    to_m: float
+    away_m: float
+    """How far its signs stand beside those of the others at most."""
+
+    @property
+    def reason(self) -> str:
+        """What is wrong with it, for people."""
+        return f"its positions are off by {self.away_m:.1f} m from {self.from_m:.0f} to {self.to_m:.0f} m of its way"
+
+
+def outages_of(dataset: Dataset, first: FirstMap) -> tuple[OutageSummary, ...]:
+    """Stretches of journeys that do not fit the others."""
+    return tuple(
+        OutageSummary(dataset.journeys[o.journey].journey_id, o.from_m, o.to_m, o.away_m)
+        for o in first.crowd.report.outages
+    )
+
+
 def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict[str, int]:
     """What each stage took and left, in the order of the stages."""
     maps, first = result.journey_maps, result.first

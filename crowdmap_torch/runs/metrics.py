@@ -14,6 +14,7 @@ from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.summaries import (
     counts_of,
     journey_summaries,
+    outages_of,
     outlier_journeys_of,
     pruned_of,
 )
@@ -43,6 +44,7 @@ def metrics_of(
         "outcome": result.state.reasons[0],
         "rejected_journeys": plain(dataset.rejected),
         "suspect_journeys": plain(outlier_journeys_of(dataset, result.first)),
+        "outages": plain(outages_of(dataset, result.first)),
         "journeys": [
             {
                 "journey_id": s.journey_id,

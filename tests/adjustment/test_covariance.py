@@ -147,7 +147,9 @@ def test_a_journey_without_a_say_has_no_bias(tiny: Dataset, tiny_result: MapResu
         first.drifts,
         PositioningNoise(),
         replace(MapperConfig().adjust, frame_spacing_m=6.0),
-        left_out=(1,),
+        trusted=[
+            torch.full_like(j.t_ns, n != 1, dtype=torch.bool) for n, j in enumerate(tiny.journeys)
+        ],
     )
     adjust.start(built)
     found = map_uncertainty(built, first.signs, first.lanes)
