@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from crowdmap_torch.io.documents import read_yaml_content
+
 VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, -1, 1, 0.0, -0.5, 1e-300, 1e18, 1e300, 1e308, 10**400, 2**63),
     *("", "x", "x" * 300, "x" * 5000, "..", "../..", "a/b", "a\nb", "\x00", "💥", "\ud800", "nan"),
@@ -49,7 +51,8 @@ def mutate_document(path: Path, rng: np.random.Generator) -> str:
         return name
     try:
         text = path.read_text("utf-8")
-        content = json.loads(text) if is_json else yaml.safe_load(text)
+        # Weighed before it is built: an earlier mutation may have left a bomb.
+        content = json.loads(text) if is_json else read_yaml_content(path)
         done = _change(content, rng)
         text = json.dumps(content) if is_json else yaml.safe_dump(content)
     except (ValueError, RecursionError, yaml.YAMLError):

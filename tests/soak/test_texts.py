@@ -36,3 +36,11 @@ def test_what_stands_in_many_places_is_one_place() -> None:
     for _ in range(40):
         shared = [shared, shared]
     assert len(list(texts._places(shared))) == 82
+
+
+@pytest.mark.parametrize("name", ["merge bomb", "alias bomb"])
+def test_a_bomb_that_is_there_already_does_not_go_off(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "rig.yaml"
+    for seed in range(6):
+        path.write_text(texts.BOMBS[name])
+        assert mutate_document(path, np.random.default_rng(seed))
