@@ -8,6 +8,7 @@ is from them shows when many have seen the same.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,7 +33,8 @@ class PosePriorConfig(Settings):
     """How far the sigmas of journeys may be from those that they are given."""
 
     scale_strength: Freedom = 24.0
-    """Degrees of freedom that the fleet's scale of the sigmas counts in a journey's own."""
+    """Degrees of freedom that the fleet's scale of the sigmas counts in a journey's own, before journeys show how far
+    their scales are apart."""
     scale_trust: Freedom = 3.0
     """Degrees of freedom that the sigmas as they are given count in the fleet's scale."""
     scale_lag_m: Length = 100.0
@@ -203,7 +205,7 @@ class PosePrior:
 
         With them the fleet's `likely` one, anew, and the mean of each journey's over its median.
         """
-        config, strength = self.config, self.config.scale_strength
+        config = self.config
         weight = (count > 0) / variance
         of_common = weight / weight.sum(0).clamp_min(1e-300)
         freedom = (count * (1 - of_common)).sum(1)
@@ -211,6 +213,7 @@ class PosePrior:
         seen = freedom > 0
         # Inverse chi-squared variances, their median the fleet's. Of it each journey tells by the mean of its inverse:
         # one that is far too bad does not move it.
+        strength = _strength(found / likely, freedom, config.scale_strength)
         centre = strength - 2 / 3
         inverse = (strength + freedom) / (centre * likely + found) * seen
         likely = strength / centre * seen.sum() / inverse.sum().clamp_min(1e-300)
@@ -245,12 +248,36 @@ def variance_of_mean(ratio: Tensor) -> Tensor:
     return 2 / ratio * (1 + torch.expm1(-ratio) / ratio)
 
 
-def _mean_over_median(given: float, found: Tensor) -> Tensor:
+def _strength(
+    found: Float[Tensor, " j"], freedom: Float[Tensor, " j"], usual: float
+) -> Float[Tensor, ""]:
+    """Degrees of freedom of the inverse chi-squared variances that journeys have, as their spread shows.
+
+    `found` are sums of so many squares in units of the fleet's median variance. Each, over `nu - 2/3`, is beta-prime with
+    half of its own degrees of freedom and half of the `nu` that are asked for (empirical Bayes; Gelman et al., Bayesian
+    Data Analysis, 5); those are about the `usual` ones.
+    """
+    seen = freedom > 0
+    n = torch.where(seen, freedom, 1.0) / 2
+    log = torch.linspace(-3, 1, 9, dtype=found.dtype, device=found.device) * math.log(2)
+    nu = (usual * log.exp())[:, None].clamp_min(_LEAST_STRENGTH)
+    x = (torch.where(seen, found, 1.0) / (nu - 2 / 3)).clamp_min(1e-12)
+    evidence = (n - 1) * x.log() - (n + nu / 2) * torch.log1p(x) - (nu - 2 / 3).log()
+    evidence = evidence + torch.lgamma(n + nu / 2) - torch.lgamma(n) - torch.lgamma(nu / 2)
+    total = (evidence * seen).sum(1) - (log / _STRENGTH_SPREAD).square() / 2
+    return (torch.softmax(total, 0) * nu[:, 0].log()).sum().exp()
+
+
+def _mean_over_median(given: float | Tensor, found: Tensor) -> Tensor:
     """Of an inverse chi-squared variance with so many degrees of freedom; 1 where none were found: it is as given."""
     freedom = (given + found).clamp_min(3)
     return torch.where(found > 0, (freedom - 2 / 3) / (freedom - 2), 1.0)
 
 
+_LEAST_STRENGTH = 3.0
+"""With fewer degrees of freedom a variance has no mean worth the name."""
+_STRENGTH_SPREAD = 1.0
+"""1-sigma of the logarithm of the journeys' degrees of freedom about the usual ones."""
 _SWEEPS = 60
 """Alternations between scales and what all journeys share."""
 _SCALES_SQUARED = (0.01, 100.0)

@@ -143,6 +143,23 @@ def test_one_journey_whose_sigmas_are_wrong_is_told_from_the_others(factor):
         assert found[4, 0] < 1.0 and (found[4, 1:] < 0.8).all()
 
 
+@pytest.mark.parametrize(("spread", "bound"), [(0.0, 0.13), (0.8, 0.27)])
+def test_drives_that_differ_are_each_taken_by_their_own_word(spread: float, bound: float):
+    """Scales between exp(-spread) and exp(spread): their errors, as logarithms, with a strength that follows the spread.
+
+    With 24 degrees of freedom whatever the drives show it is 0.30 in a fleet whose scales differ by up to five times.
+    """
+    squares = []
+    for seed in range(4):
+        g = torch.Generator().manual_seed(seed)
+        log = spread * (2 * torch.rand(20, 1, generator=g, dtype=F64) - 1)
+        prior, scale = make_prior(20, way_m=500.0), log.exp().expand(20, 3).contiguous()
+        found = prior.rescaled(drawn(prior, scale, seed), torch.ones_like(scale))
+        squares.append((found.log() - log).square().mean(0))
+    rms = torch.stack(squares).mean(0).sqrt()
+    assert (rms[1:] < bound).all()
+
+
 def test_scales_do_not_depend_on_where_they_start():
     prior = make_prior(6)
     drift = drawn(prior, torch.ones(6, 3, dtype=F64), seed=3)
