@@ -23,6 +23,7 @@ from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import read_truth
 from crowdmap_torch.optim import band_cholesky
 from crowdmap_torch.optim.linearize import term_costs
+from crowdmap_torch.optim.solvers import tiled_cholesky, windows
 from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of
 from crowdmap_torch.tables import Dataset, Rows, to_device
 
@@ -59,10 +60,12 @@ def here(folder: Path) -> Dataset:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_way_to_factor_bands() -> Iterator[None]:
-    """LAPACK, which the CPU has and no other device, rounds otherwise in the last bits."""
+def one_way_to_compute() -> Iterator[None]:
+    """What the CPU does and no other device rounds otherwise in the last bits: LAPACK's bands, products in place."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(band_cholesky, "_by_lapack", band_cholesky._by_blocks)
+        patch.setattr(windows, "_in_place", lambda device: False)
+        patch.setattr(tiled_cholesky, "_by_tiles", lambda matrix: False)
         yield
 
 

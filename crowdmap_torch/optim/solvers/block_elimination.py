@@ -1,101 +1,144 @@
 """The arithmetic of one round of elimination: what the blocks that go leave behind.
 
 Of block j with the diagonal D_j = L_j L_j^T, the links E_j to its neighbours, the coupling B_j and the right-hand side a_j
-remain, besides the fill-in at the neighbours, W_j = L_j^-1 and P_j = -D_j^-1 E_j for the back-substitution, and in the
-store, in place of B_j and a_j, B_j W_j^T and W_j a_j: their products are what leaves the reduced system,
+remain, besides the fill-in at the neighbours, W_j = L_j^-1 and V_j = -W_j E_j for the back-substitution; B_j and a_j stay in
+the store. The products of B_j W_j^T and W_j a_j are what leaves the reduced system,
 
     C - sum_j B_j D_j^-1 B_j^T        b - sum_j B_j D_j^-1 a_j.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.windows import Batch
-
-_WORTH_HALVING = 64
-"""Width of a window from which half of the entries below the diagonal are not worked out."""
+from crowdmap_torch.optim.solvers.windows import Batch, Product, Round
+from crowdmap_torch.processes.threads import in_order
 
 
 @dataclass(frozen=True)
 class Lead:
-    """What the elimination of a batch leaves to other blocks of its chains."""
+    """What the elimination of a round leaves to other blocks of its chains."""
 
     whiten: Float[Tensor, "e k k"]
     """W, the inverse Cholesky factors of the diagonals."""
     towards: Float[Tensor, "e k _"]
-    """P, minus the inverse diagonals times the links to the neighbours."""
-    square: Float[Tensor, "e _ _"]
-    """To be added to the neighbours' diagonals and to the link between them."""
+    """V, minus these times the links to the neighbours."""
+
+    def square(self) -> Float[Tensor, "e _ _"]:
+        """To be added to the neighbours' diagonals and to the link between them."""
+        V = self.towards
+        return torch.baddbmm(V.new_zeros(1, 1, 1), V.mT, V, beta=0, alpha=-1)
 
 
-def lead_of(batch: Batch, diagonal: Float[Tensor, "p k k"], link: Float[Tensor, "p k k"]) -> Lead:
-    """What a batch leaves behind of itself."""
-    factor, failed = torch.linalg.cholesky_ex(diagonal[batch.place])
+def lead_of(
+    of_round: Round, diagonal: Float[Tensor, "p k k"], link: Float[Tensor, "p k k"]
+) -> Lead:
+    """What a round leaves behind of itself."""
+    factor, failed = torch.linalg.cholesky_ex(diagonal[of_round.place])
     # A block that is not positive definite spoils all that follows, and the whole step fails.
-    inverse = torch.cholesky_inverse(factor).where((failed == 0)[:, None, None], torch.nan)
-    links = link[batch.place]
-    if batch.neighbour.shape[1] == 2:
-        links = torch.cat((link[batch.neighbour[:, 0]].mT, links), dim=-1)
-    towards = (inverse @ links).neg_()
-    return Lead(factor.mT @ inverse, towards, links.mT @ towards)
+    factor = factor.where((failed == 0)[:, None, None], torch.nan)
+    k = factor.shape[-1]
+    eye = torch.eye(k, dtype=factor.dtype, device=factor.device).neg_().expand_as(factor)
+    links = [eye, link[of_round.place]]
+    if of_round.neighbour.shape[1] == 2:
+        links.insert(1, link[of_round.neighbour[:, 0]].mT)
+    both = torch.linalg.solve_triangular(factor, torch.cat(links, dim=-1), upper=False).neg_()
+    return Lead(both[..., :k], both[..., k:])
 
 
 def fill_chain(
-    batch: Batch,
+    of_round: Round,
     square: Float[Tensor, "e _ _"],
     diagonal: Float[Tensor, "p k k"],
     link: Float[Tensor, "p k k"],
 ) -> None:
     """Adds the fill-in of the blocks that go to the diagonals and links of their neighbours, in place."""
-    (e, sides), k = batch.neighbour.shape, diagonal.shape[-1]
+    neighbour, k = of_round.neighbour, diagonal.shape[-1]
+    e, sides = neighbour.shape
     own = square.view(e, sides, k, sides, k).diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
-    diagonal.view(-1, k * k).index_add_(0, batch.neighbour.flatten(), own.reshape(-1, k * k))
+    diagonal.view(-1, k * k).index_add_(0, neighbour.flatten(), own.reshape(-1, k * k))
     if sides == 2:
-        link[batch.neighbour[:, 0]] = square[:, :k, k:]
+        link[neighbour[:, 0]] = square[:, :k, k:]
 
 
 @dataclass(frozen=True)
 class Eliminated:
     """What the elimination of a batch leaves to others."""
 
-    lead: Lead
-    at: Int[Tensor, " ww"]
-    product: Float[Tensor, " ww"]
-    """To be added to the reduced system, and where."""
     fill: Float[Tensor, "rows k"]
     """To be added to the neighbours' rows of the store."""
+    wide: Float[Tensor, "b w gk"]
+    """The whitened rows of every group's window."""
+    scattered: Float[Tensor, " ww"] | None
+    """Their products, to be added to the reduced system, unless they are subtracted run by run."""
 
 
 def eliminate(
     batch: Batch,
-    diagonal: Float[Tensor, "p k k"],
-    link: Float[Tensor, "p k k"],
+    whiten: Float[Tensor, "e k k"],
+    towards: Float[Tensor, "e k _"],
     store: Float[Tensor, "rows k"],
-    stride: int,
 ) -> Eliminated:
-    """What a batch leaves behind, for a reduced system of `stride` columns; its rows of the store are whitened in place."""
+    """What a batch leaves behind, by its part of the round's lead."""
     groups, size, w, _ = batch.fill.shape
     k = store.shape[-1]
-    lead = lead_of(batch, diagonal, link)
     rows = rows_of(batch, store)
-    # Adding rows as they are is several times faster than subtracting them: P carries the sign.
-    fill = (rows @ lead.towards).view(-1, k)
-    rows.copy_(rows @ lead.whiten.mT)
-    wide = rows.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
-    half = w // 2 if w >= _WORTH_HALVING else w
-    ats, products = [], []
-    for here, there in ((slice(half), slice(w)), (slice(half, w), slice(half, w))):
-        if here.start == w:
-            continue
-        column = batch.columns[:, there]
-        ats.append((batch.columns[:, here, None] * stride + column[:, None]).flatten())
-        products.append((wide[:, here] @ wide[:, there].mT).neg_().flatten())
-    return Eliminated(lead, torch.cat(ats), torch.cat(products), fill)
+    whitened = rows @ whiten.mT
+    # Adding rows as they are is several times faster than subtracting them: V carries the sign.
+    fill = (whitened @ towards).view(-1, k)
+    wide = whitened.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
+    scattered = None if batch.products is not None else (wide @ wide.mT).neg_().flatten()
+    return Eliminated(fill, wide, scattered)
+
+
+def scatter(
+    batch: Batch, product: Float[Tensor, " ww"], system: Float[Tensor, "stride stride"]
+) -> None:
+    """Adds the products of a batch's windows to the reduced system, in place."""
+    at = batch.columns[:, :, None] * len(system) + batch.columns[:, None]
+    system.view(-1).index_add_(0, at.flatten(), product)
+
+
+class Products:
+    """Products that wait to be subtracted from the reduced system: stripe by stripe, each on one core, in order."""
+
+    def __init__(self, system: Float[Tensor, "stride stride"]) -> None:
+        self._system = system
+        self._waiting: dict[int, list[tuple[Product, Tensor]]] = {}
+        self._held = 0
+
+    def add(self, products: Iterable[tuple[int, Product]], wide: Float[Tensor, "b w gk"]) -> None:
+        """Products of a batch's windows."""
+        for stripe, product in products:
+            self._waiting.setdefault(stripe, []).append((product, wide))
+        self._held += wide.numel()
+        if self._held > _HELD:
+            self.subtract()
+
+    def subtract(self) -> None:
+        """Subtracts all that wait."""
+
+        def of_stripe(waiting: list[tuple[Product, Tensor]]) -> None:
+            for product, wide in waiting:
+                of_group = wide[product.group]
+                self._system[product.here].addmm_(
+                    of_group[product.rows], of_group[product.beside].mT, alpha=-1
+                )
+
+        # The long stripes first.
+        stripes = [self._waiting[stripe] for stripe in sorted(self._waiting)]
+        for _ in in_order(of_stripe, stripes, self._system.device):
+            pass
+        self._waiting, self._held = {}, 0
+
+
+_HELD = 1 << 24
+"""Numbers of windows that may wait."""
 
 
 def rows_of(batch: Batch, store: Float[Tensor, "rows k"]) -> Float[Tensor, "e w k"]:

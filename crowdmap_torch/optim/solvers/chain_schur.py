@@ -25,7 +25,15 @@ from torch import Tensor
 from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, assemble
-from crowdmap_torch.optim.solvers.block_elimination import Lead, eliminate, fill_chain, rows_of
+from crowdmap_torch.optim.solvers.block_elimination import (
+    Lead,
+    Products,
+    eliminate,
+    fill_chain,
+    lead_of,
+    rows_of,
+    scatter,
+)
 from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
 from crowdmap_torch.optim.solvers.layout import Layout, SparsityPattern, read_entries
@@ -39,7 +47,8 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 )
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
-from crowdmap_torch.optim.solvers.windows import Batch
+from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
+from crowdmap_torch.optim.solvers.windows import Batch, Round
 from crowdmap_torch.processes.threads import in_order
 
 UNOBSERVED_FLOOR = 1e-9
@@ -99,7 +108,7 @@ class ChainBackend:
             )
             block = values[self.plan.chains]
             k = problem.variables[self.plan.chains].tangent_dim
-            self._workspace = Workspace(block.new_empty(self._structure.store_rows + 1, k))
+            self._workspace = Workspace.of(self._structure, block, k)
             self._pattern = SparsityPattern.of(problem, values)
         assert self._structure is not None and self._workspace is not None
         return self._structure, self._workspace
@@ -109,12 +118,20 @@ class ChainBackend:
 class Workspace:
     """What the solves of one back end share: memory is taken once."""
 
+    system: Float[Tensor, "s s"]
+    """Matrix of the reduced system, upper triangle; one row more for its right-hand side, one for padding."""
     store: Float[Tensor, "rows k"]
-    """Per eliminated block and column of its window a row of `k`; once eliminated, whitened by its diagonal."""
+    """Per eliminated block and column of its window a row of `k`, by when it is eliminated."""
     couplings: dict[str, Float[Tensor, "f w k"]] = field(default_factory=dict)
     """Of the last normal equations, by term."""
     factor: Factor | None = None
     """Of the last solve."""
+
+    @classmethod
+    def of(cls, structure: ChainStructure, like: Tensor, k: int) -> Workspace:
+        """Memory for eliminated blocks of `k` unknowns, with the device and the type of `like`."""
+        dim = structure.where.dim + 2
+        return cls(like.new_zeros(dim, dim), like.new_empty(structure.store_rows + 1, k))
 
     def coupling(self, name: str, shape: torch.Size) -> Float[Tensor, "f w k"]:
         """Memory for a term's coupling; what is in it is of no account."""
@@ -128,9 +145,9 @@ class Factor:
     """The factorised matrix, together with the store."""
 
     leads: list[Lead]
-    """By batch."""
-    reduced: Float[Tensor, "r r"]
-    """Cholesky factor of S, the upper one."""
+    """By round."""
+    reduced: TiledCholesky
+    """Of S."""
 
 
 @dataclass(frozen=True)
@@ -190,8 +207,7 @@ class ChainNormalEquations:
         if self.factorise(nothing, torch.full_like(self.gradient, floor)) is None:
             raise ValueError("the chains' blocks are not positive definite without damping")
         assert self.workspace.factor is not None
-        matrix = torch.cholesky_inverse(self.workspace.factor.reduced, upper=True)
-        return LandmarkCovariance(matrix, self.structure.where)
+        return LandmarkCovariance(self.workspace.factor.reduced.inverse(), self.structure.where)
 
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, the landmarks known."""
@@ -209,29 +225,39 @@ class ChainNormalEquations:
         structure, store = self.structure, self.workspace.store
         store.zero_()
         for name, block in self.coupling.items():
-            store.index_add_(0, structure.factor_rows[name], block.flatten(0, 1))
+            rows, block = structure.factor_rows[name], block.flatten(0, 1)
+            if name in structure.alone:
+                store.index_copy_(0, rows, block)
+            else:
+                store.index_add_(0, rows, block)
         store[structure.right_side_row] = self.eliminated_gradient
         dim = len(self.gradient)
-        # One row and column more for the right-hand side, one for padding.
-        system = torch.nn.functional.pad(self.hessian + torch.diag(added_y), (0, 2, 0, 2))
+        system = self.workspace.system
+        system[:dim, :dim] = self.hessian
         system[dim, :dim] = self.gradient
+        system.diagonal()[:dim].add_(added_y)
         diagonal, link = structure.by_place(self.diagonal + torch.diag_embed(added_x), self.link)
-        leads = []
+        leads, products = [], Products(system)
         for of_round in structure.rounds:
-            parts = in_order(
-                lambda batch: eliminate(batch, diagonal, link, store, len(system)),
-                of_round,
-                store.device,
-            )
-            for batch, part in zip(of_round, parts, strict=True):
-                leads.append(part.lead)
-                fill_chain(batch, part.lead.square, diagonal, link)
-                system.view(-1).index_add_(0, part.at, part.product)
+            lead = lead_of(of_round, diagonal, link)
+            leads.append(lead)
+            fill_chain(of_round, lead.square(), diagonal, link)
+
+            def eliminated(batch: Batch, of_round: Round = of_round, lead: Lead = lead):
+                here = of_round.of_batch(batch)
+                return eliminate(batch, lead.whiten[here], lead.towards[here], store)
+
+            parts = in_order(eliminated, of_round.batches, store.device)
+            for batch, part in zip(of_round.batches, parts, strict=True):
                 store.index_add_(0, batch.fill.flatten(), part.fill)
-        S = system[:dim, :dim]
-        # What is not positive definite on the way gives numbers that are not finite.
-        reduced, failed = torch.linalg.cholesky_ex(S, upper=True)
-        if bool(failed) or not bool(S.isfinite().all()):
+                if part.scattered is not None:
+                    scatter(batch, part.scattered, system)
+                elif batch.products is not None:
+                    products.add(batch.products, part.wide)
+        products.subtract()
+        # What is not positive definite on the way gives numbers that are not finite, and the factors none either.
+        reduced = TiledCholesky.of(system[:dim, :dim])
+        if reduced is None:
             return None
         self.workspace.factor = Factor(leads, reduced)
         return system[dim, :dim]
@@ -239,7 +265,7 @@ class ChainNormalEquations:
     def solve_reduced(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
         """S^-1 of right-hand sides, by the last factors."""
         assert self.workspace.factor is not None
-        return torch.cholesky_solve(right_side, self.workspace.factor.reduced, upper=True)
+        return self.workspace.factor.reduced.solve(right_side)
 
     def solve_eliminated(self, right_side: Float[Tensor, "e k c"]) -> Float[Tensor, "e k c"]:
         """A^-1 of right-hand sides, by the last factors.
@@ -251,14 +277,16 @@ class ChainNormalEquations:
         rest = right_side.new_zeros(len(structure.order), *right_side.shape[1:])
         rest[structure.place] = right_side
         solution = torch.zeros_like(rest)
-        steps = list(zip(structure.batches, factor.leads, strict=True))
-        for batch, lead in steps:
-            fill = (lead.towards.mT @ rest[batch.place]).view(-1, *right_side.shape[1:])
-            rest.index_add_(0, batch.neighbour.flatten(), fill)
-        for batch, lead in reversed(steps):
-            beside = solution[batch.neighbour].flatten(1, 2)
-            own = lead.whiten.mT @ (lead.whiten @ rest[batch.place])
-            solution[batch.place] = own + lead.towards @ beside
+        steps = list(zip(structure.rounds, factor.leads, strict=True))
+        for of_round, lead in steps:
+            whitened = lead.whiten @ rest[of_round.place]
+            rest[of_round.place] = whitened
+            fill = (lead.towards.mT @ whitened).view(-1, *right_side.shape[1:])
+            rest.index_add_(0, of_round.neighbour.flatten(), fill)
+        for of_round, lead in reversed(steps):
+            beside = solution[of_round.neighbour].flatten(1, 2)
+            own = rest[of_round.place] + lead.towards @ beside
+            solution[of_round.place] = lead.whiten.mT @ own
         return solution[structure.place]
 
     def couple(
@@ -292,21 +320,15 @@ class ChainNormalEquations:
         known = torch.cat((y, y.new_tensor([1.0, 0.0])))
         x = y.new_zeros(len(structure.order), store.shape[1])
 
-        def substitute(item: tuple[Batch, Lead]) -> Float[Tensor, "e k"]:
-            batch, lead = item
+        def of_landmarks(batch: Batch) -> Float[Tensor, "e k"]:
             window = known[batch.columns].repeat_interleave(batch.fill.shape[1], 0)[:, None]
-            own = (window @ rows_of(batch, store)).mT
-            beside = x[batch.neighbour].flatten(1)[..., None]
-            return (lead.towards @ beside - lead.whiten.mT @ own)[..., 0]
+            return (window @ rows_of(batch, store))[:, 0]
 
-        last = len(factor.leads)
-        for of_round in reversed(structure.rounds):
-            mine = slice(last - len(of_round), last)
-            last = mine.start
-            items = list(zip(of_round, factor.leads[mine], strict=True))
-            parts = in_order(substitute, items, x.device)
-            for batch, part in zip(of_round, parts, strict=True):
-                x[batch.place] = part
+        for of_round, lead in zip(reversed(structure.rounds), reversed(factor.leads), strict=True):
+            own = torch.cat(list(in_order(of_landmarks, of_round.batches, x.device)))
+            beside = x[of_round.neighbour].flatten(1)[..., None]
+            whitened = lead.towards @ beside - lead.whiten @ own[..., None]
+            x[of_round.place] = (lead.whiten.mT @ whitened)[..., 0]
         return x[structure.place]
 
 
@@ -355,7 +377,6 @@ def chain_equations(
 ) -> ChainNormalEquations:
     """Normal equations of chains and leaves alone, from their blocks; `structure` knows of no landmarks."""
     nothing = gradient.new_zeros(0)
-    store = gradient.new_empty(structure.store_rows + 1, gradient.shape[1])
     return ChainNormalEquations(
         cost=gradient.new_zeros(1),
         term_cost={},
@@ -366,5 +387,5 @@ def chain_equations(
         coupling={},
         hessian=nothing.view(0, 0),
         gradient=nothing,
-        workspace=Workspace(store),
+        workspace=Workspace.of(structure, gradient, gradient.shape[1]),
     )

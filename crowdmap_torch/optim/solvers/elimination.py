@@ -29,7 +29,7 @@ from torch import Tensor
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values
 from crowdmap_torch.optim.solvers.layout import Layout, layout
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
-from crowdmap_torch.optim.solvers.windows import Batch, LandmarkBlocks, WindowBuilder
+from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, Round, WindowBuilder
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,8 @@ class ChainStructure:
     couplings: dict[str, Coupling]
     factor_rows: dict[str, Int[Tensor, " fw"]]
     """Row of the store of every column of a coupling's factors."""
+    alone: frozenset[str]
+    """Terms of whose factors none has a row of the store in common with another's, and that come first."""
     order: Int[Tensor, " places"]
     """Block at every place of the order of elimination; the number of blocks where a group has fewer, and last."""
     place: Int[Tensor, " e"]
@@ -70,17 +72,11 @@ class ChainStructure:
     """Row of the store of every block's right-hand side."""
     store_rows: int
     """Rows of the store; one more takes what is to be forgotten."""
-    rounds: tuple[tuple[Batch, ...], ...]
-    """Of blocks that do not touch each other, eliminated at once."""
+    rounds: tuple[Round, ...]
     owner: Int[Tensor, " e"]
     """Chain that each block belongs to, counted over leaves and chains."""
     border: Layout
     """The border's variables, one behind the other."""
-
-    @property
-    def batches(self) -> list[Batch]:
-        """Of all rounds, in order."""
-        return [batch for of_round in self.rounds for batch in of_round]
 
     def by_place(
         self, diagonal: Float[Tensor, "e k k"], link: Float[Tensor, "e k k"]
@@ -115,29 +111,37 @@ def analyse(
     landmarks, and the blocks that its chain shares.
     """
     where, landmarks, couplings, keys = _touched(problem, values, plan)
+    rank = _rank(keys, landmarks) if plan.rank is None else plan.rank
+    where = where.in_order(torch.argsort(rank[: len(landmarks.column)], stable=True))
+    landmarks = LandmarkBlocks.of(where, plan.chain.device)
+    couplings = {
+        name: replace(c, column=landmarks.columns(c.landmark, c.widths))
+        for name, c in couplings.items()
+    }
     owner = plan.owner
     k = problem.variables[plan.chains].tangent_dim
     # About as many as there are drives: those that see one stretch of road at the same step.
     size = group_size or min(64, max(4, plan.chain_count))
-    rank = _rank(keys, landmarks) if plan.rank is None else plan.rank
-    builder = WindowBuilder(landmarks, rank, len(owner), size, k, batch_bytes)
+    builder = WindowBuilder(landmarks, len(owner), size, k, batch_bytes)
     windows = [
         builder.windows(node, neighbour, coupled)
         for node, neighbour, coupled in _rounds(keys, plan, landmarks.count)
     ]
-    places = [table.flatten() for _, _, batches in windows for table, _ in batches]
+    places = [table.flatten() for _, _, batches in windows for table, *_ in batches]
     order = torch.cat((*places, owner.new_full((1,), len(owner))))
     place = torch.full((len(owner) + 1,), len(order) - 1, device=owner.device)
     place[order] = torch.arange(len(order), device=owner.device)
     place[-1] = len(order) - 1
+    factor_rows = {
+        name: builder.rows(c.block, c.landmark, c.widths) for name, c in couplings.items()
+    }
     return ChainStructure(
         plan=plan,
         where=where,
         couplings=couplings,
         rounds=tuple(builder.round(*of_round, place) for of_round in windows),
-        factor_rows={
-            name: builder.rows(c.block, c.landmark, c.widths) for name, c in couplings.items()
-        },
+        factor_rows=factor_rows,
+        alone=_alone(factor_rows, builder.store_rows),
         order=order,
         place=place[:-1],
         right_side_row=builder.first_row[:-1],
@@ -145,6 +149,18 @@ def analyse(
         owner=owner,
         border=layout(problem, values, skip=_all_but(problem, plan.border_names)),
     )
+
+
+def _alone(rows: Mapping[str, Int[Tensor, " fw"]], size: int) -> frozenset[str]:
+    """The terms that may be copied into a store of this size, as no row of theirs is taken by then."""
+    alone, taken = set(), None
+    for name, of_term in rows.items():
+        if taken is None:
+            taken = torch.zeros(size, dtype=torch.long, device=of_term.device)
+        taken.index_add_(0, of_term, torch.ones_like(of_term))
+        if bool((taken[of_term] == 1).all()):
+            alone.add(name)
+    return frozenset(alone)
 
 
 def landmark_rank(problem: Problem, values: Values, plan: EliminationPlan) -> Float[Tensor, " q"]:
@@ -231,19 +247,10 @@ def _coupling(
     first = torch.nonzero(begins)[:, 0]
     first = first if order is None else order[first]
     landmark = torch.stack([index[first] for index in others], dim=-1)
-    column = torch.cat(
-        [
-            landmarks.column[index[first]][:, None]
-            + torch.arange(landmarks.width_of[other], device=block.device)
-            for (other, _), index in zip(
-                (s for i, s in enumerate(term.slots) if i != slot), others, strict=True
-            )
-        ],
-        dim=-1,
-    )
     widths = tuple(
         landmarks.width_of[other] for i, (other, _) in enumerate(term.slots) if i != slot
     )
+    column = landmarks.columns(landmark, widths)
     return Coupling(order, factor_of_row, block[first], column, landmark, widths, slot)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,6 +23,21 @@ class Layout:
     dim: int
     used: Bool[Tensor, "groups dim"]
     """False for the padding of groups with fewer unknowns than the largest."""
+
+    def in_order(self, block: Int[Tensor, " q"]) -> Layout:
+        """The same for one problem, the blocks of all variables, numbered behind each other, in this order."""
+        device = block.device
+        width = torch.cat(
+            [
+                torch.full((len(at),), self.tangent_dim[name], device=device)
+                for name, at in self.offset.items()
+            ]
+            or [block]
+        )
+        begins = torch.empty_like(block)
+        begins[block] = width[block].cumsum(0) - width[block]
+        sizes = [len(at) for at in self.offset.values()]
+        return replace(self, offset=dict(zip(self.offset, begins.split(sizes), strict=True)))
 
     def entries(self, name: str, block: Int[Tensor, " m"] | slice) -> Int[Tensor, "m k"]:
         """Where the tangents of blocks of a variable lie."""

@@ -1,8 +1,8 @@
 """Selected blocks of the inverse of A: the covariances of eliminated blocks, all that stays held.
 
-With P_j and W_j of `block_elimination` the inverse's block of an eliminated j follows from those of its neighbours n:
+With W_j, V_j of `block_elimination` and P_j = W_j^T V_j the block of an eliminated j follows from those of its neighbours n:
 
-    (A^-1)_jj = W_j^T W_j + P_j (A^-1)_nn P_j^T        (A^-1)_jn = P_j (A^-1)_nn
+    (A^-1)_jj = D_j^-1 + P_j (A^-1)_nn P_j^T        (A^-1)_jn = P_j (A^-1)_nn
 
 From the last round to the first; what two neighbours have in common is known once the later one is (Takahashi, Fagan and
 Chen 1973).
@@ -25,24 +25,25 @@ def diagonal_of_inverse(
     k = diagonal.shape[-1]
     at_place, links = structure.by_place(diagonal, link)
     steps = []
-    for batch in structure.batches:
-        lead = lead_of(batch, at_place, links)
-        fill_chain(batch, lead.square, at_place, links)
-        steps.append((batch, lead.whiten, lead.towards))
+    for of_round in structure.rounds:
+        lead = lead_of(of_round, at_place, links)
+        fill_chain(of_round, lead.square(), at_place, links)
+        inverse, towards = lead.whiten.mT @ lead.whiten, lead.whiten.mT @ lead.towards
+        steps.append((of_round, inverse, towards))
     found = diagonal.new_zeros(len(structure.order), k, k)
     # With the block that follows, of those known so far.
     crossed = torch.zeros_like(found)
-    for batch, whiten, towards in reversed(steps):
-        around = found[batch.neighbour]
-        if batch.neighbour.shape[1] == 2:
-            before = batch.neighbour[:, 0]
+    for of_round, inverse, towards in reversed(steps):
+        around = found[of_round.neighbour]
+        if of_round.neighbour.shape[1] == 2:
+            before = of_round.neighbour[:, 0]
             both = crossed[before]
             upper = torch.cat((around[:, 0], both), dim=-1)
             beside = torch.cat((upper, torch.cat((both.mT, around[:, 1]), dim=-1)), dim=1)
             with_neighbours = towards @ beside
             crossed[before] = with_neighbours[..., :k].mT
-            crossed[batch.place] = with_neighbours[..., k:]
+            crossed[of_round.place] = with_neighbours[..., k:]
         else:
             with_neighbours = towards @ around[:, 0]
-        found[batch.place] = whiten.mT @ whiten + with_neighbours @ towards.mT
+        found[of_round.place] = inverse + with_neighbours @ towards.mT
     return found[structure.place]

@@ -4,18 +4,43 @@ An eliminated block leaves fill-in in the columns of the landmarks that it is co
 see the same stretch of road, driven by anybody, form a group with one window, so that their products are one matrix product.
 Groups of the same width are computed together, in batches of bounded size. The store has one row per block and column of
 its window, and is as wide as a block; batch follows batch in it.
+
+Landmarks that are seen together have columns near each other. Where a window is wide and of few runs of columns, a processor
+subtracts its products from the reduced system in place, run by run, above the diagonal alone; else they are scattered.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
 from crowdmap_torch.optim.solvers.layout import Layout
+
+_WORTH_RUNS = 64
+"""Width from which a window's products are worth a call for each pair of its runs."""
+_RUN = 32
+"""Mean length of runs from which they are worth it too."""
+_GAP = 2
+"""Landmarks that are taken into a window to join two runs of columns, at most."""
+_STRIPES = 12
+"""Stripes that the reduced system is cut into, about: runs end where they do, so that each has a row of products."""
+
+
+class Product(NamedTuple):
+    """Some rows of a group's window times others: what leaves a part of the reduced system."""
+
+    group: int
+    """Of the batch."""
+    rows: slice
+    beside: slice
+    """Rows of the window, the others of them."""
+    here: tuple[slice, slice]
+    """The part of the reduced system, as its rows and columns."""
 
 
 @dataclass(frozen=True)
@@ -24,20 +49,36 @@ class Batch:
 
     place: slice
     """Places of the order of elimination, group by group."""
-    neighbour: Int[Tensor, "e s"]
-    """Places of the blocks that each is linked to: before and behind it in the chain, or a leaf's carrier; the
-    last place of all for none."""
     columns: Int[Tensor, "b w"]
     """The windows: columns of the reduced system; first its right-hand side, `dim`, and `dim + 1` for padding."""
     fill: Int[Tensor, "b g w s"]
     """Row of the store that each entry's fill-in goes to, for every neighbour of the block."""
     first_row: int
     """Where the batch's rows begin in the store."""
+    products: tuple[tuple[int, Product], ...] | None
+    """The stripe and the product of every pair of runs; None: they are scattered."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """Blocks that do not touch each other, eliminated at once."""
+
+    place: slice
+    """Places of the order of elimination, batch by batch."""
+    neighbour: Int[Tensor, "e s"]
+    """Places of the blocks that each is linked to: before and behind it in the chain, or a leaf's carrier; the
+    last place of all for none."""
+    batches: tuple[Batch, ...]
+
+    def of_batch(self, batch: Batch) -> slice:
+        """The batch's places among those of the round."""
+        first = self.place.start
+        return slice(batch.place.start - first, batch.place.stop - first)
 
 
 @dataclass(frozen=True)
 class LandmarkBlocks:
-    """The blocks of the variables that stay, numbered behind each other."""
+    """The blocks of the variables that stay, numbered behind each other, and their columns in any order."""
 
     first: dict[str, int]
     """Number of each variable's first block."""
@@ -47,6 +88,10 @@ class LandmarkBlocks:
     width_of: dict[str, int]
     """Of the blocks of each variable."""
     dim: int
+    ordered: Int[Tensor, " q"]
+    """The blocks in the order of their columns."""
+    position: Int[Tensor, " q"]
+    """Where in that order each is."""
 
     @classmethod
     def of(cls, where: Layout, device: torch.device) -> LandmarkBlocks:
@@ -59,9 +104,20 @@ class LandmarkBlocks:
             widths.append(torch.full_like(offset, where.tangent_dim[name]))
         none = torch.zeros(0, dtype=torch.long, device=device)
         width_of = {name: where.tangent_dim[name] for name in first}
+        column = torch.cat([none, *columns])
+        ordered = torch.argsort(column)
+        position = torch.argsort(ordered)
         return cls(
-            first, torch.cat([none, *columns]), torch.cat([none, *widths]), width_of, where.dim
+            first, column, torch.cat([none, *widths]), width_of, where.dim, ordered, position
         )
+
+    def columns(self, landmark: Int[Tensor, "f q"], widths: Sequence[int]) -> Int[Tensor, "f w"]:
+        """All columns of some landmarks of these widths."""
+        parts = [
+            self.column[lm][:, None] + torch.arange(width, device=lm.device)
+            for lm, width in zip(landmark.unbind(1), widths, strict=True)
+        ]
+        return torch.cat(parts, dim=-1)
 
     @property
     def count(self) -> int:
@@ -74,14 +130,14 @@ class WindowBuilder:
     """Lays the rounds out in the store."""
 
     landmarks: LandmarkBlocks
-    rank: Tensor
     n: int
     group_size: int
     k: int
     batch_bytes: int
 
     def __post_init__(self) -> None:
-        device = self.rank.device
+        device = self.landmarks.column.device
+        self.in_place = _in_place(device)
         self.store_rows = 0
         self.places = 0
         self.batch_rows: list[int] = []
@@ -90,14 +146,14 @@ class WindowBuilder:
         self.groups = 0
         self.window_keys: list[Tensor] = []
         self.window_places: list[Tensor] = []
-        # The blocks of a variable lie behind each other, and so do the variables.
-        width = self.landmarks.width
-        self.landmark_of = torch.repeat_interleave(torch.arange(len(width), device=device), width)
+        ordered = self.landmarks.ordered
+        self.landmark_of = torch.repeat_interleave(ordered, self.landmarks.width[ordered])
+        self.stripe = min(256, max(48, self.landmarks.dim // _STRIPES))
         self._keys = self._places = torch.zeros(0, dtype=torch.long, device=device)
 
     def windows(
         self, node: Tensor, neighbour: Tensor, keys: Tensor
-    ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
+    ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor, bool]]]:
         """Groups the blocks of a round, and gives every group its window and its rows in the store."""
         count, device = self.landmarks.count, node.device
         place = torch.full((self.n + 1,), -1, dtype=torch.long, device=device)
@@ -106,33 +162,38 @@ class WindowBuilder:
         width = torch.zeros(len(node), dtype=torch.double, device=device)
         width.index_add_(0, block, self.landmarks.width[landmark].double())
         position = torch.zeros_like(width).index_add_(
-            0, block, self.rank[landmark] * self.landmarks.width[landmark]
+            0, block, (self.landmarks.position[landmark] * self.landmarks.width[landmark]).double()
         ) / width.clamp_min(1)
         # Blocks that see lanes have windows several times as wide as those that see signs alone: keep them apart.
         wide = width > width.mean()
-        order = torch.argsort(position + wide * (len(self.rank) + 1), stable=True)
-        size = self.group_size
-        if bool(width.mean() > self.landmarks.dim / 2):
-            size = min(len(node), 4 * size)
-        group_count = -(-len(node) // size)
+        order = torch.argsort(position + wide * (count + 1), stable=True)
+        group_count = -(-len(node) // self.group_size)
+        size = -(-len(node) // group_count)
         table = torch.full((group_count * size,), self.n, dtype=torch.long, device=device)
         table[: len(node)] = node[order]
         group = torch.empty(len(node), dtype=torch.long, device=device)
         group[order] = torch.arange(len(node), device=device) // size
-        window = torch.unique(group[block] * count + landmark)
-        of, landmark = window // count, window % count
+        window = torch.unique(group[block] * count + self.landmarks.position[landmark])
+        window = _joined(window, count)
+        of, landmark = window // count, self.landmarks.ordered[window % count]
         each = self.landmarks.width[landmark]
         # The gradient is every window's first column.
         start = each.cumsum(0) - each
         total = torch.zeros(group_count, dtype=torch.long, device=device).index_add_(0, of, each)
         start = start - (total.cumsum(0) - total)[of] + 1
-        self.window_keys.append((self.groups + of) * count + landmark)
+        self.window_keys.append(self.groups * count + window)
         self.window_places.append(start)
         padded = _padded(total + 1)
+        breaks = torch.ones_like(window, dtype=torch.bool)
+        breaks[1:] = window[1:] != window[:-1] + 1
+        breaks[1:] |= of[1:] != of[:-1]
+        runs = torch.zeros_like(total).index_add_(0, of, breaks.long())
+        in_runs = (total >= _WORTH_RUNS) & (total >= _RUN * runs) & self.in_place
         table = table.view(group_count, size)
         batches = []
-        for w in torch.unique(padded).tolist():
-            members = torch.nonzero(padded == w)[:, 0]
+        for kind in torch.unique(2 * padded + in_runs).tolist():
+            w, by_run = kind // 2, bool(kind % 2)
+            members = torch.nonzero(2 * padded + in_runs == kind)[:, 0]
             most = max(1, self.batch_bytes // (size * w * self.k * 8))
             for part in members.split(most):
                 rows = self.store_rows + torch.arange(len(part) * size, device=device).mul_(w).view(
@@ -142,29 +203,52 @@ class WindowBuilder:
                 self.group_of[table[part]] = self.groups + part[:, None].expand(-1, size)
                 self.batch_rows.append(self.store_rows)
                 columns = _expand(of, landmark, start, part, w, group_count, self)
-                batches.append((table[part], columns))
+                batches.append((table[part], columns, by_run))
                 self.store_rows += len(part) * size * w
         self.first_row[self.n] = self.group_of[self.n] = -1
         self.groups += group_count
         return node, neighbour, batches
 
     def round(
-        self, node: Tensor, neighbour: Tensor, batches: list[tuple[Tensor, Tensor]], place: Tensor
-    ) -> tuple[Batch, ...]:
+        self,
+        node: Tensor,
+        neighbour: Tensor,
+        batches: list[tuple[Tensor, Tensor, bool]],
+        place: Tensor,
+    ) -> Round:
         """The round with the rows that every fill-in goes to; once all rounds have their windows."""
         towards = torch.full(
             (self.n + 1, neighbour.shape[1]), self.n, dtype=torch.long, device=node.device
         )
         towards[node] = neighbour
-        built = []
-        for nodes, columns in batches:
+        built, beside, first = [], [], self.places
+        for nodes, columns, by_run in batches:
             receiver = towards[nodes]
             fill = self._fill_rows(columns, receiver)
             here = slice(self.places, self.places + nodes.numel())
             self.places = here.stop
-            beside = place[receiver].flatten(0, 1)
-            built.append(Batch(here, beside, columns, fill, self.batch_rows.pop(0)))
-        return tuple(built)
+            beside.append(place[receiver].flatten(0, 1))
+            products = self._products(columns) if by_run else None
+            built.append(Batch(here, columns, fill, self.batch_rows.pop(0), products))
+        return Round(slice(first, self.places), torch.cat(beside), tuple(built))
+
+    def _products(self, columns: Tensor) -> tuple[tuple[int, Product], ...]:
+        """The pairs of runs of windows, and the stripe of the reduced system that each pair is in."""
+        dim, products = self.landmarks.dim, []
+        before = torch.nn.functional.pad(columns, (1, 0), value=-1)[:, :-1]
+        begins = (columns < dim) & ((columns != before + 1) | (columns % self.stripe == 0))
+        group, first = torch.nonzero(begins, as_tuple=True)
+        column = columns[group, first]
+        total = (columns < dim).sum(1) + 1
+        last = torch.cat((first[1:], first.new_zeros(1)))
+        last = torch.where(last > first, last, total[group])
+        runs = torch.stack((group, first, last, column), dim=1).tolist()
+        for i, (b, start, stop, at) in enumerate(runs):
+            rows, here = slice(start, stop), slice(at, at + stop - start)
+            products.append((-1, Product(b, slice(0, 1), rows, (slice(dim, dim + 1), here))))
+            for beside, there in _in_one(run[1:] for run in runs[i:] if run[0] == b):
+                products.append((at // self.stripe, Product(b, rows, beside, (here, there))))
+        return tuple(products)
 
     def _fill_rows(self, columns: Tensor, receiver: Tensor) -> Tensor:
         """Store rows [b, g, w, s] of the windows' columns at the receivers [b, g, s]."""
@@ -197,9 +281,9 @@ class WindowBuilder:
             self._keys, self._places = torch.cat(self.window_keys), torch.cat(self.window_places)
             self.window_keys, self.window_places = [], []
         group, landmark = torch.broadcast_tensors(group, landmark)
-        key = group * self.landmarks.count + landmark
         if not len(self._keys):
-            return torch.zeros_like(key), torch.zeros_like(key, dtype=torch.bool)
+            return torch.zeros_like(landmark), torch.zeros_like(landmark, dtype=torch.bool)
+        key = group * self.landmarks.count + self.landmarks.position[landmark]
         at = torch.searchsorted(self._keys, key).clamp_max(len(self._keys) - 1)
         return self._places[at], self._keys[at] == key
 
@@ -226,6 +310,32 @@ def _expand(
     at = mine[entry]
     columns[row[of[at]], start[at] + rest] = landmarks.column[landmark[at]] + rest
     return columns
+
+
+def _in_place(device: torch.device) -> bool:
+    """Whether products may be subtracted in place, run by run: where a call costs little."""
+    return device.type == "cpu"
+
+
+def _in_one(runs: Iterable[Sequence[int]]) -> list[tuple[slice, slice]]:
+    """Runs (first row of the window, behind its last, first column), those in one where they follow each other."""
+    joined: list[list[int]] = []
+    for start, stop, column in runs:
+        if joined and joined[-1][1] == start and joined[-1][2] + start - joined[-1][0] == column:
+            joined[-1][1] = stop
+        else:
+            joined.append([start, stop, column])
+    return [(slice(a, b), slice(at, at + b - a)) for a, b, at in joined]
+
+
+def _joined(window: Int[Tensor, " n"], count: int) -> Int[Tensor, " m"]:
+    """Sorted keys `group * count + place` with those between that close small gaps of a group."""
+    gap = window[1:] - window[:-1] - 1
+    gap = torch.where(window[1:] // count == window[:-1] // count, gap, 0)
+    more = torch.nn.functional.pad(torch.where(gap <= _GAP, gap, 0), (0, 1))[: len(window)] + 1
+    entry = torch.repeat_interleave(torch.arange(len(window), device=window.device), more)
+    first = (more.cumsum(0) - more)[entry]
+    return window[entry] + torch.arange(len(entry), device=window.device) - first
 
 
 def _padded(width: Tensor) -> Tensor:
