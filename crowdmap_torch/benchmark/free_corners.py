@@ -257,15 +257,15 @@ def bundle(
     prior = poses(problem.prior_q, problem.prior_p)
     fx, fy, cx, cy = tensor(problem.K)
     uv, n = tensor(problem.obs_uv), len(prior)
-    observation = uv.new_zeros(len(uv), 3, 3)
-    observation[:, 0, 0], observation[:, 1, 1], observation[:, 2, 2] = fx, fy, 1.0
-    observation[:, 0, 2], observation[:, 1, 2] = cx - uv[:, 0], cy - uv[:, 1]
+    observation = uv.new_zeros(3, 3, len(uv))
+    observation[0, 0], observation[1, 1], observation[2, 2] = fx, fy, 1.0
+    observation[0, 2], observation[1, 2] = cx - uv[:, 0], cy - uv[:, 1]
     first = tensor(problem.odo_i)
     terms = {
         "corner": CostTerm(
             reprojection.point_reprojection,
             (("pose", tensor(problem.obs_pose)), ("point", tensor(problem.obs_pt))),
-            (observation,),
+            (observation.movedim(-1, 0),),
             uv.new_full((len(uv),), 1 / problem.sig_px),
             loss,
             reprojection.point_reprojection_jacobian,

@@ -22,7 +22,7 @@ from crowdmap_torch.optim.problem import (
 from crowdmap_torch.optim.robust import JointLoss
 from crowdmap_torch.processes.threads import in_order
 
-CHUNK_ROWS = 1 << 14
+CHUNK_ROWS = 1 << 13
 """Rows that are linearised at once; bounds the memory, whatever the size of the problem."""
 
 
@@ -31,7 +31,9 @@ def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
     return replace(
         term,
         slots=tuple((name, block[index]) for name, block in term.slots),
-        constants=tuple(constant[index] for constant in term.constants),
+        constants=tuple(
+            _rows_last(constant)[..., index].movedim(-1, 0) for constant in term.constants
+        ),
         weight=None if term.weight is None else term.weight[index],
         loss=term.loss.of_rows(index) if isinstance(term.loss, JointLoss) else term.loss,
         shared=None if term.shared is None else term.shared.of_rows(index),
@@ -258,7 +260,13 @@ def _evaluate(term: CostTerm, arguments: tuple[Tensor, ...]) -> Float[Tensor, "d
 def _arguments(term: CostTerm, values: Values) -> tuple[Tensor, ...]:
     """What the residual takes, the rows as the last axis: the blocks of every slot and the constants."""
     blocks = (values[name].index_select(0, block) for name, block in term.slots)
-    return tuple(x.movedim(0, -1).contiguous() for x in (*blocks, *term.constants))
+    return tuple(_rows_last(x) for x in (*blocks, *term.constants))
+
+
+def _rows_last(x: Float[Tensor, "m ..."]) -> Float[Tensor, "... m"]:
+    """The same with the rows as the last axis, and a row's next neighbour in memory: copied unless it lies there so."""
+    x = x.movedim(0, -1)
+    return x if x.stride(-1) == 1 else x.contiguous()
 
 
 def _scale(weight: Float[Tensor, " m"] | Float[Tensor, "m d"]) -> Float[Tensor, "#d m"]:
@@ -282,7 +290,10 @@ def term_costs(
 
 def _losses(problem: Problem, piece: CostTerm, values: Values) -> Float[Tensor, " groups"]:
     """`1/2 sum rho` of some rows, for each of the independent problems."""
-    rho = piece.loss.rho(residuals(piece, values).square().sum(-1)) / 2
+    residual = _evaluate(piece, _arguments(piece, values))
+    if piece.weight is not None:
+        residual = residual * _scale(piece.weight)
+    rho = piece.loss.rho(residual.square().sum(0)) / 2
     group = problem.group_of_rows(piece)
     if group is None:
         return rho.sum()[None]

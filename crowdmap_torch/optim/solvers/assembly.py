@@ -104,13 +104,15 @@ class BlockDiagonal:
         for name, kind in problem.variables.items():
             n, k = len(values[name]), kind.tangent_dim
             self._gradient[name] = like.new_zeros(k, n)
-            self._square[name] = like.new_zeros(k * k, n)
+            self._square[name] = like.new_zeros(k, k, n)
 
     def add(self, chunk: TermRows[RowBlocks]) -> None:
         """Adds the rows' gradients and diagonal blocks."""
         for i, (name, block) in enumerate(chunk.slots):
             self._gradient[name].index_add_(1, block, chunk.blocks.gradient[i])
-            self._square[name].index_add_(1, block, chunk.blocks.hessian[i, i].flatten(0, 1))
+            # The blocks are symmetric.
+            for row, entries in enumerate(chunk.blocks.hessian[i, i]):
+                self._square[name][row, row:].index_add_(1, block, entries[row:])
 
     def gradient(self, name: str) -> Float[Tensor, "n k"]:
         """The gradient of a variable."""
@@ -118,8 +120,8 @@ class BlockDiagonal:
 
     def hessian(self, name: str) -> Float[Tensor, "n k k"]:
         """The diagonal blocks of a variable."""
-        square, k = self._square[name], len(self._gradient[name])
-        return square.mT.reshape(square.shape[1], k, k)
+        upper = self._square[name].permute(2, 0, 1).contiguous()
+        return upper + upper.triu(1).mT
 
 
 def add_blocks(
