@@ -21,9 +21,9 @@ from torch import Tensor
 
 from crowdmap_torch.optim.solvers.layout import Layout
 
-_WORTH_RUNS = 64
+_WORTH_RUNS = 160
 """Width from which a window's products are worth a call for each pair of its runs."""
-_RUN = 32
+_RUN = 64
 """Mean length of runs from which they are worth it too."""
 _GAP = 2
 """Landmarks that are taken into a window to join two runs of columns, at most."""
@@ -148,7 +148,7 @@ class WindowBuilder:
         self.window_places: list[Tensor] = []
         ordered = self.landmarks.ordered
         self.landmark_of = torch.repeat_interleave(ordered, self.landmarks.width[ordered])
-        self.stripe = min(256, max(48, self.landmarks.dim // _STRIPES))
+        self.stripe = min(256, max(96, self.landmarks.dim // _STRIPES))
         self._keys = self._places = torch.zeros(0, dtype=torch.long, device=device)
 
     def windows(
@@ -243,10 +243,11 @@ class WindowBuilder:
         last = torch.cat((first[1:], first.new_zeros(1)))
         last = torch.where(last > first, last, total[group])
         runs = torch.stack((group, first, last, column), dim=1).tolist()
+        ends = torch.searchsorted(group, group, right=True).tolist()
         for i, (b, start, stop, at) in enumerate(runs):
             rows, here = slice(start, stop), slice(at, at + stop - start)
             products.append((-1, Product(b, slice(0, 1), rows, (slice(dim, dim + 1), here))))
-            for beside, there in _in_one(run[1:] for run in runs[i:] if run[0] == b):
+            for beside, there in _in_one(runs[i : ends[i]]):
                 products.append((at // self.stripe, Product(b, rows, beside, (here, there))))
         return tuple(products)
 
@@ -318,9 +319,9 @@ def _in_place(device: torch.device) -> bool:
 
 
 def _in_one(runs: Iterable[Sequence[int]]) -> list[tuple[slice, slice]]:
-    """Runs (first row of the window, behind its last, first column), those in one where they follow each other."""
+    """Runs (group, first row of its window, behind its last, first column), in one where they follow each other."""
     joined: list[list[int]] = []
-    for start, stop, column in runs:
+    for _, start, stop, column in runs:
         if joined and joined[-1][1] == start and joined[-1][2] + start - joined[-1][0] == column:
             joined[-1][1] = stop
         else:
