@@ -57,10 +57,7 @@ def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:
     """Whitened residuals of all rows."""
     if not len(term):
         return torch.zeros(0, 1, dtype=next(iter(values.values())).dtype)
-    residual = _evaluate(term, _arguments(term, values))
-    if term.shared is not None:
-        residual = term.shared.whiten(residual)
-    return (residual if term.weight is None else residual * _scale(term.weight)).mT.contiguous()
+    return _whitened(term, values).mT.contiguous()
 
 
 @dataclass(frozen=True)
@@ -250,6 +247,14 @@ def _pulled_back(
     return torch.stack([pull(row.movedim(-1, 0))[0].mT for row in gradient])
 
 
+def _whitened(term: CostTerm, values: Values) -> Float[Tensor, "d m"]:
+    """Whitened residuals of all rows."""
+    residual = _evaluate(term, _arguments(term, values))
+    if term.shared is not None:
+        residual = term.shared.whiten(residual)
+    return residual if term.weight is None else residual * _scale(term.weight)
+
+
 def _evaluate(term: CostTerm, arguments: tuple[Tensor, ...]) -> Float[Tensor, "d m"]:
     """The residual of all rows."""
     if term.takes_rows or term.jacobian is not None:
@@ -290,10 +295,7 @@ def term_costs(
 
 def _losses(problem: Problem, piece: CostTerm, values: Values) -> Float[Tensor, " groups"]:
     """`1/2 sum rho` of some rows, for each of the independent problems."""
-    residual = _evaluate(piece, _arguments(piece, values))
-    if piece.weight is not None:
-        residual = residual * _scale(piece.weight)
-    rho = piece.loss.rho(residual.square().sum(0)) / 2
+    rho = piece.loss.rho(_whitened(piece, values).square().sum(0)) / 2
     group = problem.group_of_rows(piece)
     if group is None:
         return rho.sum()[None]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.linearize import chunks, residuals, row_blocks, rows, term_costs
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
-from crowdmap_torch.optim.robust import JointTukey
+from crowdmap_torch.optim.robust import JointTukey, Loss, Quadratic
 from crowdmap_torch.optim.shared_errors import SharedErrors
 
 F64 = torch.float64
@@ -54,7 +54,7 @@ def test_whitened_rows_have_unit_covariance(counts: list[int]):
 
 
 def linear_term(
-    shared: SharedErrors, bound: float = 50.0
+    shared: SharedErrors, loss: Loss | None = None
 ) -> tuple[CostTerm, dict[str, Variable], dict[str, Tensor]]:
     """Rows that are linear in one block of three numbers."""
     g = torch.Generator().manual_seed(1)
@@ -66,28 +66,39 @@ def linear_term(
         return (J * x).sum(1) - target
 
     sigma = torch.full((m,), 0.5, dtype=F64)
-    loss = JointTukey.by_efficiency(shared.run, torch.tensor(bound, dtype=F64), row_dim=2)
+    joint = JointTukey.by_efficiency(shared.run, torch.tensor(50.0, dtype=F64), row_dim=2)
     term = CostTerm(
-        residual, (("x", block),), (J, target), 1 / sigma, loss, takes_rows=True, shared=shared
+        residual,
+        (("x", block),),
+        (J, target),
+        1 / sigma,
+        loss or joint,
+        takes_rows=True,
+        shared=shared,
     )
     return term, {"x": Variable(3, euclidean)}, {"x": torch.randn(1, 3, generator=g, dtype=F64)}
 
 
-def test_normal_equations_are_those_of_the_joint_covariance():
+def test_costs_and_normal_equations_are_those_of_the_joint_covariance():
     shared = drawn([3, 8, 1, 4, 5])
-    term, variables, values = linear_term(shared, 1e9)
+    term, variables, values = linear_term(shared, Quadratic())
     blocks = row_blocks(term, variables, values)
     J, target = term.constants
     error = (J * values["x"][0]).sum(-1) - target
-    H, g = torch.zeros(3, 3, dtype=F64), torch.zeros(3, dtype=F64)
+    H, g, cost = (torch.zeros(size, dtype=F64) for size in ((3, 3), (3,), ()))
     for run in range(5):
         own = torch.nonzero(shared.run == run)[:, 0]
         for number in range(2):
             information = torch.linalg.inv(covariance(shared, own, number) * 0.25)
             H += J[own, number].mT @ information @ J[own, number]
             g += J[own, number].mT @ information @ error[own, number]
+            cost += error[own, number] @ information @ error[own, number] / 2
     torch.testing.assert_close(blocks.hessian[0, 0].sum(-1), H, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(blocks.gradient[0].sum(-1), g, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(blocks.rho.sum() / 2, cost, rtol=1e-8, atol=0)
+    # What steps are judged by is the same.
+    tried = term_costs(Problem(variables, {"all": term}), values)["all"][0]
+    torch.testing.assert_close(tried, cost, rtol=1e-8, atol=0)
 
 
 def test_runs_are_not_parted_by_chunks_nor_mixed_up_by_an_order():
