@@ -57,8 +57,9 @@ class RunRecord:
     rejected: tuple[RejectedJourney, ...] = ()
     """Journeys set aside at the door."""
     outlier_journeys: tuple[RejectedJourney, ...] = ()
-    outages: tuple[OutageSummary, ...] = ()
     """Journeys that lost their weight."""
+    outages: tuple[OutageSummary, ...] = ()
+    """Stretches of journeys that lost theirs."""
     calibration: FleetCalibration = field(default_factory=dict)
     """What cars have wrong for good."""
     spectra: tuple[Eigengap, ...] = ()

@@ -8,7 +8,7 @@ from crowdmap_torch.evaluation.evaluate import evaluate_map
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.plots import Eigengap
 from crowdmap_torch.report.record import RunRecord
-from crowdmap_torch.report.summaries import JourneySummary, Pruned
+from crowdmap_torch.report.summaries import JourneySummary, OutageSummary, Pruned
 from crowdmap_torch.tables import RejectedJourney
 
 
@@ -67,6 +67,7 @@ def record(build: Builder) -> RunRecord:
         pruned=(Pruned("signs", "too little parallax", 3), Pruned("signs", "too short", 12)),
         rejected=(RejectedJourney("c", "poses.parquet: row 3: x is NaN"),),
         outlier_journeys=(RejectedJourney("d", "its bias of 9.8 m does not fit the others"),),
+        outages=(OutageSummary("a", 120.0, 310.4, 2.75),),
         spectra=(Eigengap("signs, round 2", (0.0, 0.01, 0.02, 0.7, 0.8), 3),),
         residual_px={"triangulated": torch.rand(200, generator=generator) + 0.1},
         iterations=iterations,

@@ -102,6 +102,10 @@ def test_reasons_and_figures_are_told(record: RunRecord, text: str):
     assert f"{record.figures.signs.absolute.total.mean:.3f}<small>m</small>" in text
 
 
+def test_stretches_without_a_say_are_named(text: str):
+    assert "its positions are off by 2.8 m from 120 to 310 m of its way" in text
+
+
 def test_a_bare_map_has_a_report(build):
     hd_map = build.hd_map(build.signs([[0.0, 0, 2]]))
     parsed = parse(report_html(RunRecord("bare", hd_map)))

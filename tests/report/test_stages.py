@@ -12,6 +12,7 @@ from tensorboard.util.tensor_util import make_ndarray
 
 from crowdmap_torch import mapper
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.crowd_signs.outages import Outage
 from crowdmap_torch.crowd_signs.outlier_journeys import OutlierJourney
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.report.stages import keep_and_log, log_crowd, log_journey
@@ -30,7 +31,8 @@ def events(tiny: Dataset, tiny_result: MapResult, tmp_path_factory) -> EventAccu
     folder: Path = tmp_path_factory.mktemp("log")
     first, report = tiny_result.first, tiny_result.first.crowd.report
     misfit = OutlierJourney(1, "its bias of 9.8 m does not fit the others")
-    crowd = replace(first.crowd, report=replace(report, outlier_journeys=(misfit,)))
+    report = replace(report, outlier_journeys=(misfit,), outages=(Outage(2, 120.0, 310.4, 2.75),))
+    crowd = replace(first.crowd, report=report)
     rejected = RejectedJourney("broken", "poses.parquet: row 3: x is NaN")
     with TensorBoardLog(folder) as log:
         for number, made in enumerate(tiny_result.journey_maps):
@@ -93,6 +95,7 @@ def test_bad_drives_are_named_with_their_reason(events, tiny):
     assert text.splitlines() == [
         "    broken: poses.parquet: row 3: x is NaN",
         f"    {tiny.journeys[1].journey_id}: its bias of 9.8 m does not fit the others",
+        f"    {tiny.journeys[2].journey_id}: its positions are off by 2.8 m from 120 to 310 m of its way",
     ]
 
 
