@@ -33,9 +33,6 @@ _OUTPUT_UNREAD = 128 + 13
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Reads the command line, runs the subcommand, and returns the exit code."""
-    parser = OneLineParser(prog="crowdmap", description="Many ordinary drives in, one map out.")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    add_subcommands(parser, "crowdmap_torch.commands", COMMANDS)
     options = argparse.Namespace(prog="crowdmap")
 
     def say(text: str) -> None:
@@ -50,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Interruptible(lambda name: say(f"ended by {name}; {kept()}")) as signals,
     ):
         try:
-            parser.parse_args(arguments, options)
+            _parser().parse_args(arguments, options)
             code = options.module.run(options) or 0
         except InputError as error:
             say(str(error))
@@ -65,6 +62,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             say(f"standard output: {_reason(fault)}")
             code = code or 1
     return 128 + signals.number if signals.number else code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = OneLineParser(prog="crowdmap", description="Many ordinary drives in, one map out.")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    add_subcommands(parser, "crowdmap_torch.commands", COMMANDS)
+    return parser
 
 
 def _reason(error: OSError) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import runpy
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -54,6 +55,40 @@ def test_what_the_program_gets_wrong_is_not_called_wrong_input(monkeypatch: pyte
     monkeypatch.setattr("crowdmap_torch.benchmark.cluster.run", mistaken)
     with pytest.raises(ValueError, match="a mistake of the program"):
         main(["benchmark", "cluster"])
+
+
+EARLY = """
+import importlib.abc, os, signal, sys
+import crowdmap_torch.cli as cli
+number = signal.Signals(int(sys.argv[2]))
+
+def come():
+    os.kill(os.getpid(), number)
+
+class Loading(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name == "torch":
+            come()
+            print("loading went on", flush=True)
+
+if sys.argv[1] == "options":
+    cli.add_subcommands = lambda *parts: come()
+else:
+    sys.meta_path.insert(0, Loading())
+sys.exit(cli.main(["optimize", "DATA", "--out", "RUN"]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("when", "out"),
+    # torch aborts the process where an exception leaves its loading.
+    [("options", ""), ("loading", "loading went on\n")],
+)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_at_the_start_is_one_line(when: str, out: str, number, code: int):
+    ended = python("-c", EARLY, when, str(int(number)))
+    said = f"crowdmap: ended by {number.name}; nothing half-written is left\n"
+    assert (ended.returncode, ended.stdout, ended.stderr) == (code, out, said)
 
 
 def test_the_list_of_subcommands_loads_none_of_them():

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import NoReturn
 
 from crowdmap_torch.io.errors import one_line
+from crowdmap_torch.processes.interrupts import loading
 
 
 def add_subcommands(
@@ -44,7 +45,8 @@ class ModuleParser(OneLineParser):
     def parse_known_args(self, args=None, namespace=None):  # pyright: ignore[reportIncompatibleMethodOverride]
         """The options, as the module declares them, and what is left."""
         try:
-            module = importlib.import_module(self.module)
+            with loading():
+                module = importlib.import_module(self.module)
         except ModuleNotFoundError as missing:
             self.error(f"needs the Python package {missing.name!r}, which is not installed")
         module.add_arguments(self)

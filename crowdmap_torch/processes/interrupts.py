@@ -2,7 +2,7 @@
 
 A signal leaves the work as an exception where the main thread is, so that whatever was begun is cleared away. Long
 calls outside Python, and code that swallows exceptions, do not hinder it: a thread beside ends the process after a grace.
-Renames that belong together are `held`: a signal waits for them.
+Renames that belong together are `held`: a signal waits for them. It waits for modules that are `loading`, too.
 """
 
 from __future__ import annotations
@@ -153,17 +153,23 @@ _kept: list[Callable[[], str]] = []
 
 
 @contextmanager
-def held() -> Iterator[None]:
-    """Inside, a signal waits: for the few renames that belong together, not for work."""
+def loading() -> Iterator[None]:
+    """Inside, a signal waits, for `GRACE_S` at most: modules of other languages may abort when their loading is left."""
     signals = _active if threading.current_thread() is threading.main_thread() else None
     if signals is not None:
         signals.hold()
     try:
-        with _RENAMING:
-            yield
+        yield
     finally:
         if signals is not None:
             signals.release()
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Inside, a signal waits: for the few renames that belong together, not for work."""
+    with loading(), _RENAMING:
+        yield
 
 
 @contextmanager

@@ -267,7 +267,12 @@ def _keep_course(path: Path) -> None:
 
         return call
 
-    write = optimize.write_report
+    write, run = optimize.write_report, optimize.run
+
+    def running(options: argparse.Namespace) -> int:
+        # What comes before is Python's own start, or the soak's.
+        say(f"at {STAGES[0]}")
+        return run(options)
 
     class Told(Progress):
         def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
@@ -278,8 +283,7 @@ def _keep_course(path: Path) -> None:
         write(*parts)
         say(f"at {STAGES[-1]}")
 
-    say(f"at {STAGES[0]}")
-    optimize.Progress, optimize.write_report = Told, written
+    optimize.run, optimize.Progress, optimize.write_report = running, Told, written
     for method, name in (
         ("keep_journey", lambda number, made: f"journey {number}"),
         ("keep_first", lambda first: "clusters"),
