@@ -12,7 +12,7 @@ from torch import Tensor
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.detections import DROPPED_LANE, DROPPED_SIGN
 from crowdmap_torch.lanes import reconstruct
-from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.mapper import MapResult, trusted_frames
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.signs import triangulate
 from crowdmap_torch.tables import Dataset
@@ -20,6 +20,7 @@ from crowdmap_torch.tables import Dataset
 MAPPED = "in the map"
 NO_TRACK = "in no track"
 OUTLIER_JOURNEY = "in a journey that does not fit the others"
+OUTAGE = "where positions of the journey are off"
 TOO_FEW_JOURNEYS = "in a landmark of too few journeys"
 IMPROBABLE = "in a sign that too many journeys passed by unseen"
 _TRACK = "in a track: "
@@ -66,6 +67,7 @@ _WHY: dict[str, tuple[str, str]] = {
         "check the rig's road normal and height",
     ),
     OUTLIER_JOURNEY: ("journeys contradict each other", "see suspect_journeys in metrics.json"),
+    OUTAGE: ("positioning failed for stretches of journeys", "see outages in metrics.json"),
     TOO_FEW_JOURNEYS: ("journeys do not see the same things", "add journeys over the same roads"),
     IMPROBABLE: (
         "most journeys that passed saw nothing there",
@@ -81,12 +83,13 @@ def sign_fates(dataset: Dataset, result: MapResult, config: MapperConfig) -> Cou
     is_certain = result.hd_map.signs.confidence >= config.min_confidence
     outliers = {found.journey for found in result.first.crowd.report.outlier_journeys}
     total = _dropped(dataset, DROPPED_SIGN)
-    for number, (made, found) in enumerate(
-        zip(result.journey_maps, result.associations, strict=True)
+    trusted = trusted_frames(dataset.journeys, result.first.crowd)
+    for number, (journey, made, found) in enumerate(
+        zip(dataset.journeys, result.journey_maps, result.associations, strict=True)
     ):
         total += _fates(
             *(made.sign_tracklets.label, made.sign_report.reason, triangulate.REASONS),
-            *(found.sign, is_certain, number in outliers),
+            *(found.sign, is_certain, trusted[number][journey.signs.frame], number in outliers),
         )
     return total
 
@@ -96,12 +99,14 @@ def lane_fates(dataset: Dataset, result: MapResult) -> Counter[str]:
     every = torch.ones(len(result.hd_map.lanes), dtype=torch.bool)
     outliers = {found.journey for found in result.first.crowd.report.outlier_journeys}
     total = _dropped(dataset, DROPPED_LANE)
-    for number, (made, found) in enumerate(
-        zip(result.journey_maps, result.associations, strict=True)
+    trusted = trusted_frames(dataset.journeys, result.first.crowd)
+    for number, (journey, made, found) in enumerate(
+        zip(dataset.journeys, result.journey_maps, result.associations, strict=True)
     ):
         total += _fates(
             *(made.lane_tracklets.label, made.lane_report.reason, reconstruct.REASONS),
-            *(found.lane, every.to(found.lane.device), number in outliers),
+            *(found.lane, every.to(found.lane.device)),
+            *(trusted[number][journey.lanes.frame], number in outliers),
         )
     return total
 
@@ -155,14 +160,18 @@ def _fates(
     reasons: Sequence[str],
     landmark: Int[Tensor, " d"],
     is_certain: Bool[Tensor, " n"],
+    trusted: Bool[Tensor, " d"],
     is_outlier: bool,
 ) -> Counter[str]:
     """Fates of one journey's detections; of several that apply the last that was reached."""
     kept = OUTLIER_JOURNEY if is_outlier else TOO_FEW_JOURNEYS
-    names = (NO_TRACK, kept, *(_TRACK + why for why in reasons[1:]), IMPROBABLE, MAPPED)
+    names = (NO_TRACK, kept, *(_TRACK + why for why in reasons[1:]), OUTAGE, IMPROBABLE, MAPPED)
     # Reason 0 is that the tracklet was kept; label -1 reads the last slot.
     of_track = torch.cat((reason + 1, reason.new_zeros(1)))
     of_landmark = torch.cat((is_certain.long() + len(names) - 2, reason.new_zeros(1)))
-    fate = torch.where(landmark >= 0, of_landmark[landmark], of_track[label])
+    of_detection = of_track[label]
+    if not is_outlier:
+        of_detection = of_detection.masked_fill((of_detection == 1) & ~trusted, names.index(OUTAGE))
+    fate = torch.where(landmark >= 0, of_landmark[landmark], of_detection)
     count = torch.bincount(fate, minlength=len(names)).tolist()
     return Counter({name: number for name, number in zip(names, count, strict=True) if number})

@@ -9,7 +9,9 @@ import torch
 from worlds.drives import without_detections
 
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.crowd_signs.outages import Outage
 from crowdmap_torch.crowd_signs.outlier_journeys import OutlierJourney
+from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.datasets import row_count
 from crowdmap_torch.lanes import reconstruct
 from crowdmap_torch.mapper import MapResult
@@ -18,6 +20,7 @@ from crowdmap_torch.report.fates import (
     IMPROBABLE,
     MAPPED,
     NO_TRACK,
+    OUTAGE,
     OUTLIER_JOURNEY,
     TOO_FEW_JOURNEYS,
     lane_fates,
@@ -83,6 +86,26 @@ def test_detections_of_kept_tracks_are_lost_to_few_journeys_or_bad_ones(
     assert again[OUTLIER_JOURNEY] + again[TOO_FEW_JOURNEYS] == kept
 
 
+def test_what_an_outage_took_the_say_of_is_told_apart(
+    tiny: Dataset, tiny_result: MapResult
+) -> None:
+    result = without_landmarks(tiny_result)
+    before = sign_fates(tiny, result, CONFIG), lane_fates(tiny, result)
+    crowd = result.first.crowd
+    end = float(station(tiny.journeys[1].T_world_camera)[-1])
+    report = replace(crowd.report, outages=(Outage(1, end / 2, end, 2.0),))
+    spoilt = replace(result, first=replace(result.first, crowd=replace(crowd, report=report)))
+    for was, now in zip(
+        before, (sign_fates(tiny, spoilt, CONFIG), lane_fates(tiny, spoilt)), strict=True
+    ):
+        assert now[OUTAGE] > 0
+        assert now[OUTAGE] + now[TOO_FEW_JOURNEYS] == was[TOO_FEW_JOURNEYS]
+        assert sum(now.values()) == sum(was.values())
+    nowhere = replace(report, outages=(Outage(1, end + 1, end + 2, 2.0),))
+    spoilt = replace(result, first=replace(result.first, crowd=replace(crowd, report=nowhere)))
+    assert sign_fates(tiny, spoilt, CONFIG) == before[0]
+
+
 def test_an_empty_map_is_told_with_a_count_for_every_reason(
     tiny: Dataset, tiny_result: MapResult
 ) -> None:
@@ -98,7 +121,7 @@ def test_an_empty_map_is_told_with_a_count_for_every_reason(
 
 def test_every_fate_that_is_explained_exists() -> None:
     tracks = {f"in a track: {why}" for why in (*triangulate.REASONS, *reconstruct.REASONS)}
-    others = {NO_TRACK, OUTLIER_JOURNEY, TOO_FEW_JOURNEYS, IMPROBABLE}
+    others = {NO_TRACK, OUTLIER_JOURNEY, OUTAGE, TOO_FEW_JOURNEYS, IMPROBABLE}
     assert _WHY.keys() <= tracks | others
 
 
