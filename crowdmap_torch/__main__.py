@@ -1,8 +1,6 @@
 """`python -m crowdmap_torch` is `crowdmap`."""
 
-import sys
-
-from crowdmap_torch.cli import main
+from crowdmap_torch.cli import program
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from crowdmap_torch import __version__
 from crowdmap_torch.commands.subcommands import OneLineParser, add_subcommands
@@ -31,8 +32,16 @@ _OUTPUT_UNREAD = 128 + 13
 """As a shell sees a program that SIGPIPE ended."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Reads the command line, runs the subcommand, and returns the exit code."""
+def program(*first: str) -> NoReturn:
+    """Is the whole process: what follows `first` on its command line is read, and it ends with the exit code."""
+    sys.exit(main([*first, *sys.argv[1:]], last=True))
+
+
+def main(arguments: Sequence[str] | None = None, *, last: bool = False) -> int:
+    """Reads the command line, runs the subcommand, and returns the exit code.
+
+    `last`: the process ends with it; a signal that comes when all is done changes nothing any more.
+    """
     options = argparse.Namespace(prog="crowdmap")
 
     def say(text: str) -> None:
@@ -44,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     code = 0
     with (
         StandardStreams() as streams,
-        Interruptible(lambda name: say(f"ended by {name}; {kept()}")) as signals,
+        Interruptible(lambda name: say(f"ended by {name}; {kept()}"), last=last) as signals,
     ):
         try:
             _parser().parse_args(arguments, options)

@@ -1,8 +1,6 @@
 """`crowdmap calibrate`, from a clone: the code is `crowdmap_torch/commands/calibrate.py`."""
 
-import sys
-
-from crowdmap_torch.cli import main
+from crowdmap_torch.cli import program
 
 if __name__ == "__main__":
-    sys.exit(main(["calibrate", *sys.argv[1:]]))
+    program("calibrate")

@@ -44,13 +44,18 @@ class Interruptible:
 
     number = 0
 
-    def __init__(self, say: Callable[[str], object]) -> None:
-        """`say` is told the signal's name, once, as the last thing."""
+    def __init__(self, say: Callable[[str], object], *, last: bool = False) -> None:
+        """`say` is told the signal's name, once, as the last thing.
+
+        `last`: the process ends after it, with the work's exit code, whatever signals come once the work is done.
+        """
         self._say = say
+        self._last = last
         self._said = threading.Lock()
         self._before: dict[int, Callable | int | None] = {}
         self._waits = False
         self._depth = 0
+        self._done = False
 
     def __enter__(self) -> Interruptible:
         global _active
@@ -81,10 +86,13 @@ class Interruptible:
         if _active is not self:
             return False
         self._depth += 1
+        self._done = self._last and kind is None and not self.number
         if self.number:
             # The thread beside goes on watching: what Python does at its end may hang too.
             self._speak()
             return True
+        if self._done:
+            return False
         for number, before in self._before.items():
             signal.signal(number, before)
         signal.set_wakeup_fd(self._wakeup)
@@ -97,7 +105,7 @@ class Interruptible:
         return False
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self.number and not self._waits:
+        if self._done or (self.number and not self._waits):
             # It is on its way out.
             return
         self.number = self.number or number

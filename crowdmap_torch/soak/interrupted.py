@@ -246,7 +246,7 @@ def _main(street: _Street, place: Path, workers: int, *options: str) -> Callable
 
     def main() -> int:
         _keep_course(place / "course")
-        return cli.main([*arguments, *more])
+        return cli.main([*arguments, *more], last=True)
 
     return main
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 
 import pytest
 from worlds.programs import PATIENCE_S, begin
@@ -59,8 +60,14 @@ def slow_end():
     atexit.register(time.sleep, 600)
     clear_away()
 
-with Interruptible(say) as signals:
+def nothing():
+    pass
+
+with Interruptible(say, last=sys.argv[1] == "nothing") as signals:
     globals()[sys.argv[1]]()
+if sys.argv[1] == "nothing":
+    begun()
+    sys.stdin.read()
 sys.exit(128 + signals.number)
 """
 CODE = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
@@ -89,6 +96,22 @@ def test_a_signal_ends_what_does_not_listen(work: str):
 
 def test_a_signal_waits_for_renames_that_belong_together():
     assert interrupt("two_renames", signal.SIGINT) == (130, "renamed\n", "ended by SIGINT\n")
+
+
+def test_a_signal_after_the_work_of_a_process_changes_nothing():
+    program = begin("-c", PROGRAM, "nothing", stdin=subprocess.PIPE)
+    assert program.stdout is not None and program.stdout.readline() == "begun\n"
+    program.send_signal(signal.SIGTERM)
+    out, err = program.communicate(timeout=PATIENCE_S)
+    assert (program.returncode, out, err) == (128, "", "")
+
+
+def test_what_goes_on_after_the_work_of_a_process_is_ended():
+    program = begin("-c", PROGRAM, "nothing", stdin=subprocess.PIPE)
+    assert program.stdout is not None and program.stdout.readline() == "begun\n"
+    program.send_signal(signal.SIGTERM)
+    assert program.wait(PATIENCE_S) == 143
+    assert program.communicate()[1] == "ended by SIGTERM\n"
 
 
 def test_handlers_are_put_back():
