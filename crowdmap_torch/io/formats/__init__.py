@@ -1,0 +1,1 @@
+"""Files of others: importers bring them into the form of FORMAT.md, exporters bring maps into theirs."""
