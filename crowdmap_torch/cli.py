@@ -22,6 +22,7 @@ COMMANDS = {
     "optimize": "map a dataset",
     "simulate": "write a simulated dataset with exact ground truth",
     "evaluate": "compare a map with a survey",
+    "export": "write a map in a format of others",
     "calibrate": "calibrate the road of a rig from surveyed points",
     "study": "draw the paper's figures, ours beside them",
     "benchmark": "measure speed and accuracy beside other software",

@@ -1,0 +1,61 @@
+"""Writes a map in a format of others: `crowdmap export MAP --to FORMAT [-o FILE] [--overwrite]`.
+
+MAP is a map, a survey whose signs have corners, or a RUN, whose map is taken. What the format has no place for is said in a
+line each.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pyarrow.parquet as pq
+
+from crowdmap_torch.io.errors import InputError, input_read
+from crowdmap_torch.io.formats.exporters.export import FORMATS, export_map
+from crowdmap_torch.io.maps import read_map
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What `crowdmap export` takes."""
+    parser.add_argument("map", type=Path, metavar="MAP", help="a map, a survey, or a RUN")
+    titles = "; ".join(f"{name}: {form.title}" for name, form in FORMATS.items())
+    parser.add_argument("--to", required=True, choices=[*FORMATS], metavar="FORMAT", help=titles)
+    parser.add_argument(
+        "-o", "--out", type=Path, metavar="FILE", help="default: beside MAP, named after it"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace a FILE that exists")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Writes the file, and prints what went into it and what did not."""
+    form = FORMATS[options.to]
+    folder = _map_folder(options.map)
+    out = options.out or folder.resolve().with_name(f"{folder.resolve().name}{form.ending}")
+    _require_free(out, folder, options.overwrite)
+    with input_read():
+        hd_map = read_map(folder)
+        tentative = folder / "tentative_signs.parquet"
+        left = pq.read_metadata(tentative).num_rows if tentative.is_file() else 0
+    losses = export_map(hd_map, out, options.to)
+    print(f"{form.title}: {out}: {len(hd_map.signs)} signs, {len(hd_map.lanes)} lane pieces")
+    if left:
+        losses = (f"{left} tentative signs, which are not part of the map", *losses)
+    for loss in losses:
+        print(f"left out: {loss}")
+
+
+def _map_folder(given: Path) -> Path:
+    """The folder of a map: itself, or that of a run."""
+    inside = given / "map"
+    return inside if not (given / "map.json").exists() and inside.is_dir() else given
+
+
+def _require_free(out: Path, folder: Path, overwrite: bool) -> None:
+    """InputError if something stands at `out` that is not to be replaced."""
+    if out.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{out}: inside the map {folder}; choose a place outside it")
+    if out.is_dir():
+        raise InputError(f"{out}: a folder; expected the name of a file")
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: exists; choose another name or give --overwrite")

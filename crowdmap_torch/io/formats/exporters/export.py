@@ -1,0 +1,44 @@
+"""Which formats a map can be exported to, and how: by the module of the format, complete or not at all."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from crowdmap_torch.io.atomic import atomic_file
+from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.tables import HdMap
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format: what people call it, and how its files end."""
+
+    title: str
+    ending: str
+    extra: str = ""
+    """The extra of the package that brings what the format needs; empty: nothing but the package."""
+
+
+FORMATS = {"geojson": ExportFormat("GeoJSON", ".geojson")}
+"""By the name of the module in this folder, whose `write(hd_map, path)` returns what it had to leave out, a line each."""
+
+
+def export_map(hd_map: HdMap, path: Path, to: str) -> tuple[str, ...]:
+    """Writes a map in a format, and returns what the format has no place for, a line each.
+
+    What was at `path` stays until the new file is complete. InputError for a format that nobody knows, or that needs
+    an extra which is not installed; OSError if the file cannot be written.
+    """
+    if to not in FORMATS:
+        raise InputError(f"format {to!r} is unknown; expected one of {', '.join(FORMATS)}")
+    try:
+        module = importlib.import_module(f"{__package__}.{to}")
+    except ModuleNotFoundError as missing:
+        raise InputError(
+            f"{FORMATS[to].title} needs the Python package {missing.name!r}, which is not installed: "
+            f"pip install 'crowdmap_torch[{FORMATS[to].extra}]'"
+        ) from missing
+    with atomic_file(path) as beside:
+        return module.write(hd_map, beside)
