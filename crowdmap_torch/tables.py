@@ -301,6 +301,14 @@ class Origin:
     lon_deg: float
     height_m: float
 
+    def is_same(self, other: Origin) -> bool:
+        """Whether two frames are one: within 1e-9 degrees and a millimetre."""
+        away_deg = max(abs(self.lat_deg - other.lat_deg), abs(self.lon_deg - other.lon_deg))
+        return away_deg <= 1e-9 and abs(self.height_m - other.height_m) <= 1e-3
+
+    def __str__(self) -> str:
+        return f"({self.lat_deg:.9f}, {self.lon_deg:.9f}, {self.height_m:.3f} m)"
+
 
 @dataclass(frozen=True)
 class RejectedJourney:

@@ -36,8 +36,6 @@ from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.survey.matching import SurveyMatchConfig
 from crowdmap_torch.tables import HdMap, Lanes, Origin, Signs, Survey, to_device
 
-_SAME_DEGREES = 1e-9
-_SAME_METRES = 1e-3
 _CONTROL_GATE_M = 1.0
 """A control sign without the survey's id is the survey's sign this near to it."""
 
@@ -161,17 +159,9 @@ def progress_scalars(
 
 def refuse_other_origin(of_map: Origin, of_survey: Origin) -> None:
     """ValueError if the two local frames touch the ellipsoid at different places."""
-    same = (
-        abs(of_map.lat_deg - of_survey.lat_deg) <= _SAME_DEGREES
-        and abs(of_map.lon_deg - of_survey.lon_deg) <= _SAME_DEGREES
-        and abs(of_map.height_m - of_survey.height_m) <= _SAME_METRES
-    )
-    if not same:
-        places = [
-            f"({o.lat_deg:.9f}, {o.lon_deg:.9f}, {o.height_m:.3f} m)" for o in (of_map, of_survey)
-        ]
+    if not of_map.is_same(of_survey):
         raise ValueError(
-            f"the map's origin {places[0]} is not the survey's {places[1]}; expected one origin. "
+            f"the map's origin {of_map} is not the survey's {of_survey}; expected one origin. "
             "Bring the survey into the map's local frame first."
         )
 

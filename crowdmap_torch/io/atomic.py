@@ -52,6 +52,19 @@ def atomic_folder(path: Path) -> Iterator[Path]:
             shutil.rmtree(beside, ignore_errors=True)
 
 
+@contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """An empty folder beside `path`; it disappears with what is left in it when the block ends."""
+    beside = _beside(path, "part")
+    try:
+        with _named(path):
+            beside.mkdir()
+            yield beside
+    finally:
+        with held():
+            shutil.rmtree(beside, ignore_errors=True)
+
+
 def drop_halves(folder: Path) -> None:
     """Removes what writers that were killed have left half-written in a folder and below; none may be writing there now."""
     for path in list(folder.rglob("*.part")):

@@ -1,4 +1,4 @@
-"""`signs.parquet` and `lanes.parquet` of a journey: what its camera detected.
+"""`signs.parquet` and `lanes.parquet` of a journey: what its camera detected, read and written.
 
 A fault of one detection's geometry drops that row and is counted; any other fault refuses the file
 (FORMAT.md).
@@ -7,10 +7,12 @@ A fault of one detection's geometry drops that row and is counted; any other fau
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -19,6 +21,7 @@ from crowdmap_torch.geometry import polygon
 from crowdmap_torch.geometry.camera import MAX_OFF_AXIS, Camera, inside_image, unproject
 from crowdmap_torch.io.columns import Lists, Sheet
 from crowdmap_torch.io.row_order import points_by_place, rank_of_lists, rows_by_content
+from crowdmap_torch.io.writing import list_column, name_column, write_parquet
 from crowdmap_torch.tables import LANE_TYPES, LaneDetections, LanePoints, SignDetections
 
 DROPPED_SIGN, DROPPED_LANE, DROPPED_LANE_POINT = "sign: ", "lane: ", "lane point: "
@@ -150,6 +153,55 @@ def read_lane_detections(
         ),
         dropped=dropped_rows | dropped,
     )
+
+
+def write_sign_detections(
+    path: Path,
+    frame: Int[np.ndarray, " n"],
+    shape: Int[np.ndarray, " n"],
+    corners_px: Float[np.ndarray, "n 8 2"],
+    type_code: Int[np.ndarray, " n"],
+    type_names: Sequence[str],
+    score: Float[np.ndarray, " n"],
+    track: Int[np.ndarray, " n"],
+) -> None:
+    """Writes `signs.parquet`: frame numbers, indices into `polygon.SHAPES` and `type_names` (-1 none), NaN for no score."""
+    count = polygon.CORNER_COUNT.numpy()[shape]
+    slots = np.arange(polygon.MAX_CORNERS) < count[:, None]
+    columns = {
+        "frame": frame,
+        "shape": name_column(shape, polygon.SHAPES),
+        "u": list_column(corners_px[..., 0][slots], count, pa.float32()),
+        "v": list_column(corners_px[..., 1][slots], count, pa.float32()),
+        "type": name_column(type_code, type_names),
+        "score": _score_column(score),
+        "track": pa.array(track, mask=track < 0),
+    }
+    write_parquet(path, columns)
+
+
+def write_lane_detections(
+    path: Path,
+    frame: Int[np.ndarray, " n"],
+    px: Float[np.ndarray, "p 2"],
+    count: Int[np.ndarray, " n"],
+    type_code: Int[np.ndarray, " n"],
+    type_names: Sequence[str],
+    score: Float[np.ndarray, " n"],
+) -> None:
+    """Writes `lanes.parquet`: frame numbers, `count` points of each row, one row after the other, the rest as of signs."""
+    columns = {
+        "frame": frame,
+        "u": list_column(px[:, 0], count, pa.float32()),
+        "v": list_column(px[:, 1], count, pa.float32()),
+        "type": name_column(type_code, type_names),
+        "score": _score_column(score),
+    }
+    write_parquet(path, columns)
+
+
+def _score_column(score: Float[np.ndarray, " n"]) -> pa.Array:
+    return pa.array(score.astype(np.float32), mask=np.isnan(score))
 
 
 def _frame_index(sheet: Sheet, frame_number: Int[np.ndarray, " f"]) -> Int[np.ndarray, " n"]:

@@ -128,13 +128,17 @@ class Document:
 
 def read_json(path: Path) -> Document:
     """The object that a JSON file holds; NaN, infinity and a key given twice are refused."""
+    return Document(path, read_json_content(path))
+
+
+def read_json_content(path: Path) -> object:
+    """The same, whatever the file holds."""
     text = read_text(path)
     try:
         _weigh_json(text)
-        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+        return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except ValueError as error:
         raise _unreadable(path, "JSON", error) from error
-    return Document(path, content)
 
 
 def read_yaml(path: Path) -> Document:

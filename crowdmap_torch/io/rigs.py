@@ -77,6 +77,24 @@ def rig_yaml(
     return "\n".join(lines) + "\n"
 
 
+def mount_urdf(
+    name: str, joints: tuple[tuple[str, str, tuple[float, ...], tuple[float, ...]], ...]
+) -> str:
+    """The text of a mount's URDF: joints that are fixed, each its parent, child, xyz [m] and rpy [rad]."""
+    links = sorted({link for parent, child, _, _ in joints for link in (parent, child)})
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<robot name="{name}">']
+    lines += [f'  <link name="{link}"/>' for link in links]
+    for parent, child, xyz, rpy in joints:
+        lines += [
+            f'  <joint name="{child}_joint" type="fixed">',
+            f'    <parent link="{parent}"/>',
+            f'    <child link="{child}"/>',
+            f'    <origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>',
+            "  </joint>",
+        ]
+    return "\n".join([*lines, "</robot>"]) + "\n"
+
+
 def refuse_unreadable(rig: Rig, path: Path, section: str) -> None:
     """InputError, at a section of a file, unless rig.yaml and rig.urdf of this rig would be read."""
     content = _sections(rig.camera, rig.road_normal_camera.tolist(), rig.camera_height)
@@ -105,6 +123,10 @@ def _sections(
         },
         "road": {"normal": [float(x) for x in road_normal_camera], "height_m": camera_height},
     }
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(repr(float(v)) for v in values)
 
 
 def _read_camera(section: Document) -> Camera:

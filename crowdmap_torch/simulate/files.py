@@ -13,15 +13,10 @@ from jaxtyping import Float
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io import poses
+from crowdmap_torch.io.detections import write_lane_detections, write_sign_detections
 from crowdmap_torch.io.documents import plain, write_json
 from crowdmap_torch.io.rigs import rig_yaml
-from crowdmap_torch.io.writing import (
-    list_column,
-    name_column,
-    points_column,
-    row_column,
-    write_parquet,
-)
+from crowdmap_torch.io.writing import name_column, points_column, row_column, write_parquet
 from crowdmap_torch.simulate.fleet import Vehicle
 from crowdmap_torch.simulate.lane_perception import TYPES, LaneRows
 from crowdmap_torch.simulate.rigs import SimulatedRig
@@ -72,33 +67,22 @@ def write_drive_poses(
 
 def write_sign_rows(path: Path, rows: SignRows, drive: Drive) -> None:
     """`signs.parquet` of a journey."""
-    count = _CORNERS[rows.shape]
-    slots = np.arange(8)[None] < count[:, None]
-    write_parquet(
+    write_sign_detections(
         path,
-        {
-            "frame": drive.frame[rows.frame],
-            "shape": name_column(rows.shape, polygon.SHAPES),
-            "u": list_column(rows.corners_px[..., 0][slots], count, pa.float32()),
-            "v": list_column(rows.corners_px[..., 1][slots], count, pa.float32()),
-            "type": name_column(rows.code, all_codes()),
-            "score": rows.score.astype(np.float32),
-            "track": pa.array(rows.track, mask=rows.track < 0),
-        },
+        drive.frame[rows.frame],
+        rows.shape,
+        rows.corners_px,
+        rows.code,
+        all_codes(),
+        rows.score,
+        rows.track,
     )
 
 
 def write_lane_rows(path: Path, rows: LaneRows, drive: Drive) -> None:
     """`lanes.parquet` of a journey."""
-    write_parquet(
-        path,
-        {
-            "frame": drive.frame[rows.frame],
-            "u": list_column(rows.px[:, 0], rows.count, pa.float32()),
-            "v": list_column(rows.px[:, 1], rows.count, pa.float32()),
-            "type": name_column(rows.type, TYPES),
-            "score": rows.score.astype(np.float32),
-        },
+    write_lane_detections(
+        path, drive.frame[rows.frame], rows.px, rows.count, rows.type, TYPES, rows.score
     )
 
 

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 
 from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.io.rigs import mount_urdf
 from crowdmap_torch.ranges import Angle, Count, Focal, LengthOrNone, Settings, Side
 
 R_FORWARD_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -82,7 +83,7 @@ def build_rig(config: RigConfig, index: int, rng: np.random.Generator) -> Simula
         R_body_camera=R_body_camera,
         camera_height=height,
         T_link_camera=np.linalg.inv(T_base_link) @ T_base_camera,
-        urdf=_urdf(rig_id, joints),
+        urdf=mount_urdf(rig_id, joints),
         pose_link=pose_link,
     )
 
@@ -132,24 +133,3 @@ def _transform(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Float[np.ndarr
     T[:3, :3] = rotation_from_rpy(*rpy)
     T[:3, 3] = xyz
     return T
-
-
-def _urdf(
-    name: str, joints: tuple[tuple[str, str, tuple[float, ...], tuple[float, ...]], ...]
-) -> str:
-    links = sorted({link for parent, child, _, _ in joints for link in (parent, child)})
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<robot name="{name}">']
-    lines += [f'  <link name="{link}"/>' for link in links]
-    for parent, child, xyz, rpy in joints:
-        lines += [
-            f'  <joint name="{child}_joint" type="fixed">',
-            f'    <parent link="{parent}"/>',
-            f'    <child link="{child}"/>',
-            f'    <origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>',
-            "  </joint>",
-        ]
-    return "\n".join([*lines, "</robot>"]) + "\n"
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return " ".join(repr(float(v)) for v in values)

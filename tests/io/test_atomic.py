@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from crowdmap_torch.io.atomic import atomic_file, atomic_folder, drop_halves
+from crowdmap_torch.io.atomic import atomic_file, atomic_folder, drop_halves, scratch_folder
 
 
 class InterruptedWriteError(Exception):
@@ -99,6 +99,16 @@ def test_a_full_disk_names_the_file_that_it_was_written_to(tmp_path: Path, atomi
     with pytest.raises(OSError, match=r"No space left on device: '.*/map'$"), atomic(path):
         raise OSError(28, "No space left on device")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scratch_folder_disappears_however_it_ends(tmp_path: Path) -> None:
+    with scratch_folder(tmp_path / "new") as beside:
+        (beside / "file").write_text("half")
+        (beside / "file").rename(tmp_path / "kept")
+    with pytest.raises(InterruptedWriteError), scratch_folder(tmp_path / "new") as beside:
+        (beside / "file").write_text("half")
+        raise InterruptedWriteError
+    assert [p.name for p in tmp_path.iterdir()] == ["kept"]
 
 
 def test_what_a_killed_writer_left_is_dropped_and_nothing_else(tmp_path: Path) -> None:
