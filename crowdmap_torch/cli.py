@@ -21,6 +21,7 @@ from crowdmap_torch.processes.streams import StandardStreams
 COMMANDS = {
     "optimize": "map a dataset",
     "simulate": "write a simulated dataset with exact ground truth",
+    "convert": "bring drives in other formats into a dataset",
     "evaluate": "compare a map with a survey",
     "export": "write a map in a format of others",
     "calibrate": "calibrate the road of a rig from surveyed points",
