@@ -21,7 +21,10 @@ class ExportFormat:
     """The extra of the package that brings what the format needs; empty: nothing but the package."""
 
 
-FORMATS = {"geojson": ExportFormat("GeoJSON", ".geojson")}
+FORMATS = {
+    "geojson": ExportFormat("GeoJSON", ".geojson"),
+    "lanelet2": ExportFormat("Lanelet2 (OSM)", ".osm"),
+}
 """By the name of the module in this folder, whose `write(hd_map, path)` returns what it had to leave out, a line each."""
 
 
