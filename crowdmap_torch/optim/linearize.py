@@ -31,13 +31,18 @@ def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
     return replace(
         term,
         slots=tuple((name, block[index]) for name, block in term.slots),
-        constants=tuple(
-            _rows_last(constant)[..., index].movedim(-1, 0) for constant in term.constants
-        ),
+        constants=tuple(_some_rows(constant, index) for constant in term.constants),
         weight=None if term.weight is None else term.weight[index],
         loss=term.loss.of_rows(index) if isinstance(term.loss, JointLoss) else term.loss,
         shared=None if term.shared is None else term.shared.of_rows(index),
     )
+
+
+def _some_rows(constant: Float[Tensor, "m ..."], index: slice | Tensor) -> Float[Tensor, "n ..."]:
+    """Some rows, as they lie in memory: rows last stay so, and are not copied where they follow each other."""
+    if constant.movedim(0, -1).stride(-1) == 1:
+        return constant.movedim(0, -1)[..., index].movedim(-1, 0)
+    return constant[index]
 
 
 def chunks(term: CostTerm, size: int = CHUNK_ROWS) -> Iterator[tuple[slice, CostTerm]]:

@@ -120,6 +120,19 @@ def test_chunks_make_up_the_term(term: CostTerm, values: Values, size: int):
     assert all(len(piece) <= size for piece in pieces)
 
 
+@pytest.mark.parametrize("rows_last", [True, False])
+def test_pieces_of_a_term_do_not_copy_what_is_constant(rows_last: bool):
+    constant = torch.arange(12.0).view(2, 6)
+    constant = constant.mT if rows_last else constant.mT.contiguous()
+    term = CostTerm(lambda x, y: x - y, (("a", torch.arange(6)),), (constant,))
+    for at, piece in linearize.chunks(term, 2):
+        (part,) = piece.constants
+        assert torch.equal(part, constant[at])
+        assert part.untyped_storage().data_ptr() == constant.untyped_storage().data_ptr()
+    some = torch.tensor([4, 1, 1])
+    assert torch.equal(linearize.rows(term, some).constants[0], constant[some])
+
+
 def test_chunks_do_not_part_rows_that_share_a_weight(term: CostTerm):
     together = torch.tensor([0, 0, 0, 1, 1, 2, 2, 2, 2, 3, 4])
     bound = torch.tensor(4.0).double()
