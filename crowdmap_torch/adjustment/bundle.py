@@ -37,7 +37,7 @@ from crowdmap_torch.optim.problem import (
 from crowdmap_torch.optim.robust import JointTukey, Tukey
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
 from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBackend
-from crowdmap_torch.optim.solvers.elimination import landmark_rank
+from crowdmap_torch.optim.solvers.elimination import planned_ahead
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.residuals import lane, reprojection, sign_prior
@@ -142,13 +142,18 @@ class Bundle(nn.Module):
 
     @torch.no_grad()
     def _elimination(self) -> EliminationPlan:
-        """Frames hang on the drift's chains, both are eliminated, the biases go last; landmarks ranked as they start."""
-        nodes, seen = self.prior.nodes, {**self._corner_term(1.0), **self._lane_terms(1.0)}
+        """Frames hang on the drift's chains, both are eliminated, the biases go last.
+
+        Landmarks are ranked as they start. From step to step lane points go over to the next control point, no further.
+        """
+        nodes, terms = self.prior.nodes, (self._corner_term, self._lane_terms)
+        seen = {name: term for make in terms for name, term in make(1.0).items()}
         shared = dict.fromkeys(self.fleet.variables, self.fleet.of_journey)
         chain, of_frame = nodes.journey, nodes.of_frame
         plan = EliminationPlan("drift", chain, "pose", of_frame, border="bias", shared=shared)
         values = self.values()
-        return replace(plan, rank=landmark_rank(Problem(self.variables, seen), values, plan))
+        problem = Problem(self.variables, {**seen, **self._slide_term()})
+        return planned_ahead(problem, values, plan, sliding=("lane",))
 
     @property
     def matches(self) -> LaneMatches:

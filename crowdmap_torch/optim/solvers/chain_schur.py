@@ -60,7 +60,7 @@ class ChainBackend:
     """Normal equations of one problem, leaves and chains eliminated as planned.
 
     The order of elimination is worked out when a problem is first seen, and kept for problems whose terms touch the same
-    blocks: weights, constants and losses may change from step to step.
+    blocks, or such as the plan has room for: weights, constants and losses may change from step to step.
     """
 
     plan: EliminationPlan
@@ -103,12 +103,19 @@ class ChainBackend:
         if self._pattern is None or not self._pattern.is_of(problem, values):
             if problem.group_count != 1:
                 raise ValueError("chains are eliminated in one problem at a time, not in a batch")
+            before = self._structure
+            if self._pattern is None or not self._pattern.is_as_large(problem, values):
+                before = None
             self._structure = analyse(
-                problem, values, self.plan, group_size=self.group_size, batch_bytes=self.batch_bytes
+                *(problem, values, self.plan),
+                group_size=self.group_size,
+                batch_bytes=self.batch_bytes,
+                before=before,
             )
-            block = values[self.plan.chains]
-            k = problem.variables[self.plan.chains].tangent_dim
-            self._workspace = Workspace.of(self._structure, block, k)
+            if before is None or self._structure.order is not before.order:
+                block = values[self.plan.chains]
+                k = problem.variables[self.plan.chains].tangent_dim
+                self._workspace = Workspace.of(self._structure, block, k)
             self._pattern = SparsityPattern.of(problem, values)
         assert self._structure is not None and self._workspace is not None
         return self._structure, self._workspace
@@ -135,7 +142,7 @@ class Workspace:
 
     def coupling(self, name: str, shape: torch.Size) -> Float[Tensor, "f w k"]:
         """Memory for a term's coupling; what is in it is of no account."""
-        if name not in self.couplings:
+        if name not in self.couplings or self.couplings[name].shape[:-1] != shape:
             self.couplings[name] = self.store.new_empty(*shape, self.store.shape[1])
         return self.couplings[name]
 

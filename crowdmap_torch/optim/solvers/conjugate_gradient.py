@@ -93,7 +93,9 @@ class ConjugateGradientBackend:
                 terms[name] = replace(term, slots=slots)
         held = Problem({name: problem.variables[name] for name in names}, terms)
         if self._pattern is None or not self._pattern.is_of(held, values):
-            self._structure = analyse(held, values, self.plan, group_size=None, batch_bytes=1 << 22)
+            # Of the landmarks none is in this problem.
+            plan = replace(self.plan, room=None)
+            self._structure = analyse(held, values, plan, group_size=None, batch_bytes=1 << 22)
             self._pattern = SparsityPattern.of(held, values)
         assert self._structure is not None
         return self._structure

@@ -18,7 +18,7 @@ that is kept, `windows` says.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -77,6 +77,16 @@ class ChainStructure:
     """Chain that each block belongs to, counted over leaves and chains."""
     border: Layout
     """The border's variables, one behind the other."""
+    keys: Int[Tensor, " keys"] = field(repr=False)
+    """What the order has room for: keys `block * count + landmark`, sorted."""
+    landmarks: LandmarkBlocks = field(repr=False)
+    windows: WindowBuilder = field(repr=False)
+
+    def with_couplings(self, couplings: Mapping[str, Coupling]) -> ChainStructure:
+        """The same order for other rows, for whose couplings it has room."""
+        placed, rows = _placed(couplings, self.landmarks, self.windows)
+        alone = _alone(rows, self.store_rows)
+        return replace(self, couplings=placed, factor_rows=rows, alone=alone)
 
     def by_place(
         self, diagonal: Float[Tensor, "e k k"], link: Float[Tensor, "e k k"]
@@ -103,21 +113,25 @@ def analyse(
     *,
     group_size: int | None,
     batch_bytes: int,
+    before: ChainStructure | None = None,
 ) -> ChainStructure:
-    """The elimination of a plan's leaves and chains in a problem.
+    """The elimination of a plan's leaves and chains in a problem; that of `before` where it is the same.
+
+    It depends on the plan and on what the rows touch now, not on what they touched before.
 
     Every row may touch one eliminated block and any landmarks; or one or two eliminated blocks, neighbours of a chain or a
     leaf and the block that carries it. Beside them it may touch the chain's own block of the border, unless it touches
     landmarks, and the blocks that its chain shares.
     """
     where, landmarks, couplings, keys = _touched(problem, values, plan)
+    if plan.room is not None:
+        fits = bool(torch.isin(keys, plan.room, assume_unique=True).all())
+        keys = plan.room if fits else torch.unique(torch.cat((plan.room, keys)))
+    if before is not None and torch.equal(keys, before.keys):
+        return before.with_couplings(couplings)
     rank = _rank(keys, landmarks) if plan.rank is None else plan.rank
     where = where.in_order(torch.argsort(rank[: len(landmarks.column)], stable=True))
     landmarks = LandmarkBlocks.of(where, plan.chain.device)
-    couplings = {
-        name: replace(c, column=landmarks.columns(c.landmark, c.widths))
-        for name, c in couplings.items()
-    }
     owner = plan.owner
     k = problem.variables[plan.chains].tangent_dim
     # About as many as there are drives: those that see one stretch of road at the same step.
@@ -132,9 +146,7 @@ def analyse(
     place = torch.full((len(owner) + 1,), len(order) - 1, device=owner.device)
     place[order] = torch.arange(len(order), device=owner.device)
     place[-1] = len(order) - 1
-    factor_rows = {
-        name: builder.rows(c.block, c.landmark, c.widths) for name, c in couplings.items()
-    }
+    couplings, factor_rows = _placed(couplings, landmarks, builder)
     return ChainStructure(
         plan=plan,
         where=where,
@@ -148,7 +160,22 @@ def analyse(
         store_rows=builder.store_rows,
         owner=owner,
         border=layout(problem, values, skip=_all_but(problem, plan.border_names)),
+        keys=keys,
+        landmarks=landmarks,
+        windows=builder,
     )
+
+
+def _placed(
+    couplings: Mapping[str, Coupling], landmarks: LandmarkBlocks, windows: WindowBuilder
+) -> tuple[dict[str, Coupling], dict[str, Int[Tensor, " fw"]]]:
+    """Couplings with their columns of the reduced system, and the rows of the store that these are."""
+    rows = {name: windows.rows(c.block, c.landmark, c.widths) for name, c in couplings.items()}
+    placed = {
+        name: replace(c, column=landmarks.columns(c.landmark, c.widths))
+        for name, c in couplings.items()
+    }
+    return placed, rows
 
 
 def _alone(rows: Mapping[str, Int[Tensor, " fw"]], size: int) -> frozenset[str]:
@@ -163,14 +190,23 @@ def _alone(rows: Mapping[str, Int[Tensor, " fw"]], size: int) -> frozenset[str]:
     return frozenset(alone)
 
 
-def landmark_rank(problem: Problem, values: Values, plan: EliminationPlan) -> Float[Tensor, " q"]:
-    """A position of every landmark on a line, such that landmarks coupled to one block are near each other.
+def planned_ahead(
+    problem: Problem, values: Values, plan: EliminationPlan, *, sliding: Collection[str] = ()
+) -> EliminationPlan:
+    """The plan with what the rows show of the landmarks, which serves them still when they have changed a little.
 
-    Worked out on the CPU. It does not have to be that of the very rows: what serves them now serves them after a few steps
-    too, when some have gone over to a neighbouring landmark.
+    Landmarks are ranked such that those coupled to one block are near each other (worked out on the CPU), and there is room
+    for rows that go over to the next landmark, by number, of the `sliding` variables.
     """
     _, landmarks, _, keys = _touched(problem, values, plan)
-    return _rank(keys, landmarks)
+    room, count = [keys], landmarks.count
+    for name in sliding:
+        first, number = landmarks.first[name], len(values[name])
+        at = keys % count - first
+        for step in (-1, 1):
+            goes = (at >= 0) & (at < number) & (at + step >= 0) & (at + step < number)
+            room.append(keys[goes] + step)
+    return replace(plan, rank=_rank(keys, landmarks), room=torch.unique(torch.cat(room)))
 
 
 def _touched(
@@ -264,7 +300,7 @@ def _coupled_landmarks(
 
 
 def _rank(keys: Int[Tensor, " keys"], landmarks: LandmarkBlocks) -> Float[Tensor, " q"]:
-    """`landmark_rank`, of couplings as keys."""
+    """A position of every landmark on a line, by couplings as keys."""
     count = landmarks.count
     # Blocks of a chain are coupled to nearly what their neighbours are: a few of them together tell the same.
     row, column = (keys // count // 8).cpu().numpy(), (keys % count).cpu().numpy()

@@ -118,7 +118,7 @@ class SparsityPattern:
     def is_of(self, problem: Problem, values: Values) -> bool:
         """Whether a problem has it, whatever tensors its slots are."""
         return (
-            self.sizes == _sizes(problem, values)
+            self.is_as_large(problem, values)
             and list(self.slots) == list(problem.terms)
             and all(
                 [name for name, _ in slots] == [name for name, _ in problem.terms[term].slots]
@@ -129,6 +129,10 @@ class SparsityPattern:
                 for term, slots in self.slots.items()
             )
         )
+
+    def is_as_large(self, problem: Problem, values: Values) -> bool:
+        """Whether a problem's variables are the same, whatever its terms touch."""
+        return self.sizes == _sizes(problem, values)
 
 
 def _sizes(problem: Problem, values: Values) -> dict[str, tuple[int, int]]:

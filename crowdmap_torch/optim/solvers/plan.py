@@ -32,7 +32,10 @@ class EliminationPlan:
     shared: Mapping[str, Int[Tensor, " j"]] = field(default_factory=dict)
     """Variables of the border that several chains have one block of in common, by name: the block of each chain."""
     rank: Float[Tensor, " q"] | None = None
-    """A position of every landmark on a line (`landmark_rank`); None: found whenever rows touch other landmarks."""
+    """A position of every landmark on a line (`planned_ahead`); None: found whenever rows touch other landmarks."""
+    room: Int[Tensor, " keys"] | None = None
+    """What eliminated blocks may be coupled to (`planned_ahead`): the order of elimination is kept while they are coupled to
+    nothing else. None: it is found whenever they are coupled to others."""
 
     def __post_init__(self) -> None:
         """Refuses chains in pieces, and leaves that hang on nothing."""
