@@ -21,7 +21,7 @@ from crowdmap_torch.io.formats.composing.compose import (
 )
 from crowdmap_torch.io.formats.composing.lines import TIME_UNITS
 from crowdmap_torch.io.formats.composing.parts import Asked
-from crowdmap_torch.ranges import Offset, argument
+from crowdmap_torch.ranges import Length, Offset, argument
 from crowdmap_torch.tables import Dataset, Origin
 
 _BUDGET = ReadingBudget(text_bytes=2 * 2**30, nodes=500_000_000)
@@ -72,6 +72,18 @@ def _add_conventions(group: argparse._ArgumentGroup) -> None:
         nargs=3,
         metavar=("X", "Y", "Z"),
         help="place of a camera that looks straight ahead, in those axes [m]",
+    )
+    group.add_argument("--camera", metavar="NAME", help="the camera of a log with several")
+    group.add_argument(
+        "--camera-height",
+        type=argument(Length),
+        metavar="M",
+        help="of a log's camera over the road, if the log does not say it or is wrong [m]",
+    )
+    group.add_argument(
+        "--heading",
+        choices=("course",),
+        help="fixes without headings: the direction of travel stands for them",
     )
     units = ", ".join(TIME_UNITS)
     group.add_argument(
@@ -151,6 +163,9 @@ def _drive(options: argparse.Namespace) -> Drive:
         time_offset_s=options.time_offset,
         sign_names=options.sign_names,
         skip_unknown_signs=options.skip_unknown_signs,
+        camera=options.camera,
+        camera_height=options.camera_height,
+        heading=options.heading,
         pixel_origin=options.pixel_origin,
     )
     return compose(

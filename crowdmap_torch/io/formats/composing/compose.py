@@ -58,7 +58,7 @@ def compose(
 ) -> Drive:
     """One journey from the parts of all sources; InputError if a part is missing, there twice, or contradicts another."""
     track = _only("poses", [(p.track, p.track.source) for p in parts if p.track is not None])
-    rigs = [(described_rig(p.rig), Path(p.rig.rig_id)) for p in parts if p.rig is not None]
+    rigs = [(described_rig(p.rig, asked), Path(p.rig.rig_id)) for p in parts if p.rig is not None]
     if rig is not None:
         rigs.append((read_given_rig(rig), rig))
     own_rig = _only("rig", rigs)

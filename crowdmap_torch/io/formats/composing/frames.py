@@ -141,6 +141,19 @@ def _at_times(
 ) -> Frames:
     """Frames at the images' times, numbered in order of time."""
     t_ns = np.unique(np.array(list(listed.values()), dtype=np.int64)) + offset_ns
+    number = np.arange(len(t_ns)) + first_frame
+    frames, notes = at_times(track, t_ns, number)
+    assert frames.frame_number is not None
+    frame_at = dict(zip(frames.t_ns.tolist(), frames.frame_number.tolist(), strict=True))
+    of_image = {name: frame_at.get(t + offset_ns, -1) for name, t in t_of.items()}
+    of_image = {name: frame for name, frame in of_image.items() if frame >= 0}
+    return Frames(frames, of_image, notes)
+
+
+def at_times(
+    track: Track, t_ns: Int[np.ndarray, " f"], number: Int[np.ndarray, " f"]
+) -> tuple[Track, tuple[str, ...]]:
+    """The trajectory at the times of images with these numbers, and how many of them it does not cover, in words."""
     known = _is_covered(track, t_ns)
     if not known.any():
         seconds = ((t_ns[0] - track.t_ns[0]) * 1e-9, (t_ns[-1] - track.t_ns[-1]) * 1e-9)
@@ -149,18 +162,13 @@ def _at_times(
             f"after the first pose, the last {seconds[1]:.3f} s after the last. Are both clocks the same "
             "(--time-offset) and times in the unit said?"
         )
-    number = np.arange(len(t_ns)) + first_frame
-    frames = interpolated(track, t_ns[known], number[known])
-    frame_at = dict(zip(t_ns[known].tolist(), number[known].tolist(), strict=True))
-    of_image = {name: frame_at.get(t + offset_ns, -1) for name, t in t_of.items()}
-    of_image = {name: frame for name, frame in of_image.items() if frame >= 0}
     notes = ()
     if lost := int((~known).sum()):
         notes = (
             f"{lost} of {len(t_ns)} images left out: before the first pose, after the last, or in a "
             f"gap of more than {MAX_GAP_S:g} s",
         )
-    return Frames(frames, of_image, notes)
+    return _interpolated(track, t_ns[known], number[known]), notes
 
 
 def _is_covered(track: Track, t_ns: Int[np.ndarray, " f"]) -> np.ndarray:
@@ -173,7 +181,9 @@ def _is_covered(track: Track, t_ns: Int[np.ndarray, " f"]) -> np.ndarray:
     return inside & (exact | ((track.t_ns[before] < t_ns) & (gap <= MAX_GAP_S * 1e9)))
 
 
-def interpolated(track: Track, t_ns: Int[np.ndarray, " f"], number: Int[np.ndarray, " f"]) -> Track:
+def _interpolated(
+    track: Track, t_ns: Int[np.ndarray, " f"], number: Int[np.ndarray, " f"]
+) -> Track:
     """The trajectory at times within it: straight between its rows, turning evenly."""
     after = np.clip(np.searchsorted(track.t_ns, t_ns), 1, max(len(track.t_ns) - 1, 1))
     after = np.minimum(after, len(track.t_ns) - 1)

@@ -121,6 +121,12 @@ class Asked:
     sign_names: Path | None = None
     """A table of names beside the package's own."""
     skip_unknown_signs: bool = False
+    camera: str | None = None
+    """The sensor of a log with several."""
+    camera_height: float | None = None
+    """Of the camera over the road [m], where a log does not say it."""
+    heading: str | None = None
+    """`course`: the direction of travel stands for the heading that fixes do not have."""
     pixel_origin: str | None = None
     """`centre` or `corner` of the first pixel, where (0, 0) is in the detections' files."""
 

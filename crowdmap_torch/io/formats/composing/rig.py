@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -72,15 +72,21 @@ def read_given_rig(path: Path) -> GivenRig:
     return GivenRig(name or "rig", rig.camera, has_mount, folder)
 
 
-def described_rig(car: CarRig) -> GivenRig:
+def described_rig(car: CarRig, asked: Asked) -> GivenRig:
     """The rig that a log describes, its road under its wheels; InputError if nobody said how high the camera is."""
-    if car.camera_height is None:
+    height = car.camera_height if asked.camera_height is None else asked.camera_height
+    if height is None:
         raise InputError(
             f"rig {car.rig_id!r}: the height of its camera over the road is not in the source; give it "
             "by --camera-height [m]"
         )
+    normal = car.road_normal_camera
+    if normal is None:
+        # The road lies under the link: its normal is the link's z axis, downwards.
+        normal = -car.T_link_camera[2, :3]
     has_mount = not np.array_equal(car.T_link_camera, np.eye(4))
-    return GivenRig(car.rig_id, car.camera, has_mount, None, car)
+    described = replace(car, road_normal_camera=normal, camera_height=height)
+    return GivenRig(car.rig_id, car.camera, has_mount, None, described)
 
 
 def camera_or_link_poses(track: Track, rig: GivenRig, asked: Asked) -> Float[np.ndarray, "n 4 4"]:
@@ -100,7 +106,7 @@ def camera_or_link_poses(track: Track, rig: GivenRig, asked: Asked) -> Float[np.
             )
         raise InputError(
             f"{track.source}: its poses are of a link, and rig {rig.rig_id!r} has no mount that says "
-            "where the camera sits on it; add one to rig.yaml, or give --axes"
+            "where the camera sits on it; add one to rig.yaml, or say --axes flu or frd and --camera-at"
         )
     if link in ("flu", "frd") and asked.camera_at is None:
         raise InputError(
@@ -123,6 +129,9 @@ def _chosen(
     if fixed is None and asked is None:
         choices = "; ".join(f"{name}: {text}" for name, text in texts.items())
         raise InputError(f"{track.source}: {what} are not in the file; give {option} ({choices})")
+    if asked == "mount" and fixed == "flu":
+        # Links of a URDF have their axes so.
+        return asked
     if fixed is not None and asked not in (None, fixed):
         raise InputError(
             f"{track.source}: {what} are {fixed} ({texts[fixed]}), not {asked}; leave {option} out"

@@ -9,7 +9,7 @@ from worlds import foreign
 
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.errors import InputError
-from crowdmap_torch.io.formats.composing.parts import CarRig
+from crowdmap_torch.io.formats.composing.parts import Asked, CarRig
 from crowdmap_torch.io.formats.composing.rig import described_rig, read_given_rig
 from crowdmap_torch.io.rigs import read_camera, read_rig
 
@@ -26,7 +26,7 @@ def test_a_described_mount_is_read_back(tmp_path: Path, pitch: float):
     xi = torch.tensor([1.0, -0.2, 0.7, 0.1, 0.0, -2.0], dtype=torch.float64)
     T = se3.exp(xi).numpy()
     T[:3, :3] = T[:3, :3] @ turn
-    described_rig(car(tmp_path, T)).write(tmp_path / "log")
+    described_rig(car(tmp_path, T), Asked()).write(tmp_path / "log")
     rig = read_rig(tmp_path / "log")
     np.testing.assert_allclose(rig.T_link_camera, T, atol=1e-9)
     assert rig.camera_height == 1.4
@@ -34,7 +34,12 @@ def test_a_described_mount_is_read_back(tmp_path: Path, pitch: float):
 
 def test_a_camera_whose_height_nobody_knows_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="give it by --camera-height"):
-        described_rig(car(tmp_path, np.eye(4), None))
+        described_rig(car(tmp_path, np.eye(4), None), Asked())
+
+
+def test_what_is_said_of_the_height_counts(tmp_path: Path):
+    described_rig(car(tmp_path, np.eye(4)), Asked(camera_height=2.0)).write(tmp_path / "log")
+    assert read_rig(tmp_path / "log").camera_height == 2.0
 
 
 def test_a_given_rig_comes_with_its_mount(tmp_path: Path):
