@@ -12,7 +12,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from crowdmap_torch.io.errors import InputError, input_read
-from crowdmap_torch.io.formats.exporters.export import FORMATS, export_map
+from crowdmap_torch.io.formats.exporters.export import FORMATS, ExportFormat, export_map
 from crowdmap_torch.io.maps import read_map
 
 
@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> None:
     form = FORMATS[options.to]
     folder = _map_folder(options.map)
     out = options.out or folder.resolve().with_name(f"{folder.resolve().name}{form.ending}")
-    _require_free(out, folder, options.overwrite)
+    _require_free(out, folder, form, options.overwrite)
     with input_read():
         hd_map = read_map(folder)
         tentative = folder / "tentative_signs.parquet"
@@ -51,11 +51,15 @@ def _map_folder(given: Path) -> Path:
     return inside if not (given / "map.json").exists() and inside.is_dir() else given
 
 
-def _require_free(out: Path, folder: Path, overwrite: bool) -> None:
+def _require_free(out: Path, folder: Path, form: ExportFormat, overwrite: bool) -> None:
     """InputError if something stands at `out` that is not to be replaced."""
     if out.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{out}: inside the map {folder}; choose a place outside it")
-    if out.is_dir():
+    if folder.resolve().is_relative_to(out.resolve()):
+        raise InputError(f"{out}: holds the map {folder}; choose a place outside it")
+    if out.is_dir() and not form.is_folder:
         raise InputError(f"{out}: a folder; expected the name of a file")
+    if out.is_dir() and any(file.suffix != form.ending for file in out.iterdir()):
+        raise InputError(f"{out}: a folder with other files in it; choose another name")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists; choose another name or give --overwrite")

@@ -6,7 +6,7 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from crowdmap_torch.io.atomic import atomic_file
+from crowdmap_torch.io.atomic import atomic_file, atomic_folder
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.tables import HdMap
 
@@ -19,11 +19,16 @@ class ExportFormat:
     ending: str
     extra: str = ""
     """The extra of the package that brings what the format needs; empty: nothing but the package."""
+    is_folder: bool = False
+    """Whether it is a folder of files."""
 
 
 FORMATS = {
     "geojson": ExportFormat("GeoJSON", ".geojson"),
     "lanelet2": ExportFormat("Lanelet2 (OSM)", ".osm"),
+    "geopackage": ExportFormat("GeoPackage", ".gpkg", extra="gis"),
+    "flatgeobuf": ExportFormat("FlatGeobuf", ".fgb", extra="gis", is_folder=True),
+    "kml": ExportFormat("KML", ".kml"),
 }
 """By the name of the module in this folder, whose `write(hd_map, path)` returns what it had to leave out, a line each."""
 
@@ -43,5 +48,5 @@ def export_map(hd_map: HdMap, path: Path, to: str) -> tuple[str, ...]:
             f"{FORMATS[to].title} needs the Python package {missing.name!r}, which is not installed: "
             f"pip install 'crowdmap_torch[{FORMATS[to].extra}]'"
         ) from missing
-    with atomic_file(path) as beside:
+    with atomic_folder(path) if FORMATS[to].is_folder else atomic_file(path) as beside:
         return module.write(hd_map, beside)

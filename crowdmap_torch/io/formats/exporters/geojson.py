@@ -6,15 +6,14 @@ origin, shared covariance and provenance as the collection's own member `crowdma
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from crowdmap_torch.io.formats.exporters.features import Layer, layers
+from crowdmap_torch.io.formats.exporters.head import head, json_text
 from crowdmap_torch.tables import HdMap
 
 _DEGREES, _METRES = 10, 5
@@ -23,14 +22,11 @@ _DEGREES, _METRES = 10, 5
 
 def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     """Writes a feature collection, one feature a line; nothing is left out."""
-    head = {
-        "origin": asdict(hd_map.origin),
-        "shared_covariance": hd_map.shared_covariance.flatten().tolist(),
-        "provenance": hd_map.provenance,
-    }
-    lines = ",\n".join(_text(feature) for layer in layers(hd_map) for feature in _features(layer))
+    lines = ",\n".join(
+        json_text(feature) for layer in layers(hd_map) for feature in _features(layer)
+    )
     path.write_text(
-        f'{{"type":"FeatureCollection","crowdmap":{_text(head)},"features":[\n{lines}\n]}}\n',
+        f'{{"type":"FeatureCollection","crowdmap":{json_text(head(hd_map))},"features":[\n{lines}\n]}}\n',
         encoding="utf-8",
     )
     return ()
@@ -62,7 +58,3 @@ def _coordinates(layer: Layer, place: Float[np.ndarray, "_ 3"]) -> list:
     if layer.geometry == "Polygon":
         return [numbers]
     return numbers[0] if layer.geometry == "Point" else numbers
-
-
-def _text(value: dict) -> str:
-    return json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))

@@ -7,9 +7,8 @@ with those that follow; signs that face them are their regulatory elements.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
@@ -20,6 +19,7 @@ from jaxtyping import Bool, Float
 from crowdmap_torch import __version__
 from crowdmap_torch.io.formats.exporters.carriageways import Carriageways, carriageways
 from crowdmap_torch.io.formats.exporters.features import Layer, lane_points, layers
+from crowdmap_torch.io.formats.exporters.head import head, json_text
 from crowdmap_torch.io.formats.exporters.sign_lanes import lanes_of_signs
 from crowdmap_torch.io.formats.geodesy import geodetic_from_local
 from crowdmap_torch.tables import HdMap
@@ -49,7 +49,7 @@ def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     lines = [
         "<?xml version='1.0' encoding='UTF-8'?>",
         f'<osm version="0.6" generator="crowdmap_torch {__version__}">',
-        f"  <note>{escape(_head(hd_map))}</note>",
+        f"  <note>{escape(json_text({'crowdmap': head(hd_map)}))}</note>",
         *_elements(hd_map, points, ways),
         "</osm>",
     ]
@@ -59,15 +59,6 @@ def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     return (
         "control points of lane markers, and sigma_m at each (the largest is kept): a way has points 1 m apart",
     )
-
-
-def _head(hd_map: HdMap) -> str:
-    head = {
-        "origin": asdict(hd_map.origin),
-        "shared_covariance": hd_map.shared_covariance.flatten().tolist(),
-        "provenance": hd_map.provenance,
-    }
-    return json.dumps({"crowdmap": head}, allow_nan=False, ensure_ascii=False)
 
 
 def _elements(hd_map: HdMap, points: list[np.ndarray], ways: Carriageways) -> Iterator[str]:
