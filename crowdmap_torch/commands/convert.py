@@ -18,11 +18,12 @@ from crowdmap_torch.io.formats.composing.compose import (
     compose,
     existing_origin,
     write_new,
+    write_survey_alone,
 )
 from crowdmap_torch.io.formats.composing.lines import TIME_UNITS
-from crowdmap_torch.io.formats.composing.parts import Asked
+from crowdmap_torch.io.formats.composing.parts import Asked, Parts
 from crowdmap_torch.ranges import Length, Offset, argument
-from crowdmap_torch.tables import Dataset, Origin
+from crowdmap_torch.tables import Dataset, Origin, Survey
 
 _BUDGET = ReadingBudget(text_bytes=2 * 2**30, nodes=500_000_000)
 """Detections of a whole drive are one text file in many formats."""
@@ -131,7 +132,15 @@ def run(options: argparse.Namespace) -> None:
             raise InputError(
                 "expected --from FORMAT SOURCE ... and --out DATASET; --formats lists formats"
             )
-        drive = _drive(options)
+        asked = _asked(options)
+        parts = _read(options, asked)
+        if not options.add and all(_is_survey_alone(part) for part in parts):
+            survey = write_survey_alone(options.out, parts, overwrite=options.overwrite)
+            _show_survey(options.out, survey, [note for part in parts for note in part.notes])
+            return
+        drive = compose(
+            parts, asked, rig=options.rig, journey_id=options.journey, vehicle_id=options.vehicle
+        )
         if options.add:
             dataset = add_to(options.out, drive)
         else:
@@ -139,21 +148,30 @@ def run(options: argparse.Namespace) -> None:
     _show(options.out, drive, dataset)
 
 
-def _drive(options: argparse.Namespace) -> Drive:
-    """What all sources give together."""
+def _is_survey_alone(part: Parts) -> bool:
+    return part.survey is not None and part.track is None and part.rig is None
+
+
+def _read(options: argparse.Namespace, asked: Asked) -> list[Parts]:
+    """What the sources give."""
     sources = [(name, tuple(map(Path, paths))) for name, *paths in options.sources]
     for name, paths in sources:
         if not paths:
             raise InputError(f"--from {name}: expected a file or a folder after the format")
         for path in paths:
             _refuse_missing(path, options.out)
+    return [registry.find(name).read(paths, asked) for name, paths in sources]
+
+
+def _asked(options: argparse.Namespace) -> Asked:
+    """What the command line says of the sources."""
     origin = None if options.origin is None else Origin(*options.origin)
     if options.add:
         there = existing_origin(options.out)
         if origin is not None and not origin.is_same(there):
             raise InputError(f"{options.out}: its origin is {there}; leave --origin out")
         origin = there
-    asked = Asked(
+    return Asked(
         origin=origin,
         world=options.world,
         link=options.axes,
@@ -167,13 +185,6 @@ def _drive(options: argparse.Namespace) -> Drive:
         camera_height=options.camera_height,
         heading=options.heading,
         pixel_origin=options.pixel_origin,
-    )
-    return compose(
-        [registry.find(name).read(paths, asked) for name, paths in sources],
-        asked,
-        rig=options.rig,
-        journey_id=options.journey,
-        vehicle_id=options.vehicle,
     )
 
 
@@ -195,6 +206,10 @@ def _show(out: Path, drive: Drive, dataset: Dataset) -> None:
         f"{out}: journey {journey.journey_id!r} with "
         + ", ".join(f"{n} {what}" for n, what in counts)
     )
+    if drive.survey is not None:
+        print(
+            f"  a survey with {len(drive.survey.sign_id)} signs and {len(drive.survey.lane_id)} lane markers"
+        )
     for note in drive.notes:
         print(f"  {note}")
     for reason, count in journey.dropped.items():
@@ -202,6 +217,14 @@ def _show(out: Path, drive: Drive, dataset: Dataset) -> None:
     if sizes := sorted({size for rows in drive.signs for size in rows.sizes_m}):
         known = ", ".join(f"[{width:g}, {height:g}]" for width, height in sizes)
         print(f"  sizes of these signs, for a --config: adjust: {{size_classes_m: [{known}]}}")
+
+
+def _show_survey(out: Path, survey: Survey, notes: list[str]) -> None:
+    print(
+        f"{out}: a survey with {len(survey.sign_id)} signs and {len(survey.lane_id)} lane markers"
+    )
+    for note in notes:
+        print(f"  {note}")
 
 
 def _list_formats() -> None:

@@ -19,16 +19,24 @@ from crowdmap_torch.io.detections import write_lane_detections, write_sign_detec
 from crowdmap_torch.io.documents import Document, plain, read_json, write_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.formats.composing.frames import Frames, find_frames
-from crowdmap_torch.io.formats.composing.parts import Asked, LaneRows, Parts, SignRows, Track
+from crowdmap_torch.io.formats.composing.parts import (
+    Asked,
+    LaneRows,
+    Parts,
+    SignRows,
+    SurveyRows,
+    Track,
+)
 from crowdmap_torch.io.formats.composing.rig import (
     GivenRig,
     camera_or_link_poses,
     described_rig,
     read_given_rig,
 )
+from crowdmap_torch.io.formats.composing.survey import write_survey
 from crowdmap_torch.io.poses import LinkPoses, write_poses
 from crowdmap_torch.processes.interrupts import held
-from crowdmap_torch.tables import LANE_TYPES, Dataset, Origin
+from crowdmap_torch.tables import LANE_TYPES, Dataset, Origin, Survey
 
 T = TypeVar("T")
 
@@ -44,6 +52,7 @@ class Drive:
     frames: Frames
     signs: tuple[SignRows, ...]
     lanes: tuple[LaneRows, ...]
+    survey: SurveyRows | None
     notes: tuple[str, ...]
     """What was left out on the way, a line each."""
 
@@ -82,17 +91,30 @@ def compose(
         frames=frames,
         signs=signs,
         lanes=lanes,
+        survey=the_survey(parts),
         notes=tuple(note for p in parts for note in p.notes) + frames.notes,
     )
 
 
+def the_survey(parts: Sequence[Parts]) -> SurveyRows | None:
+    """The survey of all sources, if one has it."""
+    found = [(p.survey, p.survey.source) for p in parts if p.survey is not None]
+    return _only("survey", found) if found else None
+
+
+def write_survey_alone(out: Path, parts: Sequence[Parts], *, overwrite: bool = False) -> Survey:
+    """Writes the survey of sources that give nothing else, complete or not there."""
+    rows = the_survey(parts)
+    origins = [p.origin for p in parts if p.origin is not None]
+    assert rows is not None and origins
+    _refuse_existing(out, "map.json", overwrite)
+    with atomic_folder(out) as folder:
+        return write_survey(folder, rows, origins[0])
+
+
 def write_new(out: Path, drive: Drive, *, overwrite: bool = False) -> Dataset:
     """Writes a data set with one journey, complete or not there; it is what its own reader reads of it."""
-    if os.path.lexists(out):
-        if not overwrite:
-            raise InputError(f"{out} exists already; choose another folder, --add or --overwrite")
-        if not out.is_dir() or (any(out.iterdir()) and not (out / "dataset.json").exists()):
-            raise InputError(f"{out} is no dataset (it has no dataset.json); it is left alone")
+    _refuse_existing(out, "dataset.json", overwrite)
     with atomic_folder(out) as folder:
         return _write(folder, drive, out)
 
@@ -106,6 +128,11 @@ def add_to(out: Path, drive: Drive) -> Dataset:
         out / name / own
         for name, own in (("journeys", drive.journey_id), ("rigs", drive.rig.rig_id))
     )
+    if drive.survey is not None and os.path.lexists(out / "survey"):
+        raise InputError(
+            f"{out / 'survey'} exists already; a data set has one survey: take the other source's poses "
+            "alone, or begin a data set of its own"
+        )
     if os.path.lexists(journey):
         raise InputError(f"{journey} exists already; give the journey another name by --journey")
     with scratch_folder(out / "added") as folder:
@@ -121,8 +148,21 @@ def add_to(out: Path, drive: Drive) -> Dataset:
             if not is_known:
                 rig.parent.mkdir(exist_ok=True)
                 new_rig.rename(rig)
+            if drive.survey is not None:
+                (folder / "survey").rename(out / "survey")
             (folder / "journeys" / drive.journey_id).rename(journey)
     return dataset
+
+
+def _refuse_existing(out: Path, head: str, overwrite: bool) -> None:
+    """InputError unless there is nothing yet, or what has this head and may be replaced."""
+    if not os.path.lexists(out):
+        return
+    what = head.removesuffix(".json")
+    if not overwrite:
+        raise InputError(f"{out} exists already; choose another folder, --add or --overwrite")
+    if not out.is_dir() or (any(out.iterdir()) and not (out / head).exists()):
+        raise InputError(f"{out} is no {what} (it has no {head}); it is left alone")
 
 
 def existing_origin(out: Path) -> Origin:
@@ -147,6 +187,8 @@ def _write(folder: Path, drive: Drive, out: Path) -> Dataset:
     _write_track(journey / "poses.parquet", drive.frames.track)
     _write_signs(journey / "signs.parquet", drive.signs, drive.frames.of_image)
     _write_lanes(journey / "lanes.parquet", drive.lanes, drive.frames.of_image)
+    if drive.survey is not None:
+        write_survey(folder / "survey", drive.survey, drive.origin)
     try:
         return load_dataset(folder, strict=True)
     except InputError as error:

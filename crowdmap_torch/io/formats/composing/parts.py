@@ -91,6 +91,24 @@ class LaneRows:
 
 
 @dataclass(frozen=True)
+class SurveyRows:
+    """Lane markers and signs whose place is known, in the world at the origin [m]."""
+
+    source: Path
+    lane_id: tuple[str, ...]
+    lane_type: Int[np.ndarray, " n"]
+    """Index into `tables.LANE_TYPES`; -1 unknown."""
+    lane_points: tuple[Float[np.ndarray, "_ 3"], ...]
+    """Two points at least of each."""
+    sign_id: tuple[str, ...]
+    sign_shape: Int[np.ndarray, " m"]
+    """Index into `polygon.SHAPES`."""
+    sign_code: tuple[str | None, ...]
+    sign_corners: tuple[Float[np.ndarray, "_ 3"], ...]
+    """Clockwise as the driver sees them; a single point is the centre of a sign whose corners are not known."""
+
+
+@dataclass(frozen=True)
 class Parts:
     """What one source gives; None for what it does not have."""
 
@@ -98,8 +116,9 @@ class Parts:
     rig: CarRig | None = None
     signs: SignRows | None = None
     lanes: LaneRows | None = None
+    survey: SurveyRows | None = None
     origin: Origin | None = None
-    """Where the world of the track touches the earth."""
+    """Where the world of the track and the survey touches the earth."""
     notes: tuple[str, ...] = ()
     """What was left out, and why, a line each."""
 
@@ -138,7 +157,7 @@ class Importer:
     summary: str
     """What it is, in a line."""
     gives: tuple[str, ...]
-    """Which of `poses`, `rig`, `signs`, `lanes`."""
+    """Which of `poses`, `rig`, `signs`, `lanes`, `survey`."""
     tested_on: str
     """`real files`, or `small files after the published layout`."""
     read: Callable[[tuple[Path, ...], Asked], Parts]

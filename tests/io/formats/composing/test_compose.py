@@ -11,9 +11,15 @@ from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.formats.composing import axes
-from crowdmap_torch.io.formats.composing.compose import add_to, compose, write_new
-from crowdmap_torch.io.formats.composing.parts import Asked, Parts, Track
+from crowdmap_torch.io.formats.composing.compose import (
+    add_to,
+    compose,
+    write_new,
+    write_survey_alone,
+)
+from crowdmap_torch.io.formats.composing.parts import Asked, Parts, SurveyRows, Track
 from crowdmap_torch.io.formats.importers import coco, tum, tusimple
+from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.tables import Origin
 
 ORIGIN = Origin(48.0, 11.0, 500.0)
@@ -166,6 +172,61 @@ def test_journeys_are_added_to_what_is_there(tmp_path: Path):
     folder = tmp_path / "DATA"
     assert sorted(path.name for path in folder.iterdir()) == ["dataset.json", "journeys", "rigs"]
     assert sorted(path.name for path in (folder / "journeys").iterdir()) == ["drive", "second"]
+
+
+def survey_rows(folder: Path) -> SurveyRows:
+    """A solid line, a sign with its corners and one whose centre alone is known."""
+    corners = np.array([[0.0, 10, 3], [1, 10, 3], [1, 10, 2], [0, 10, 2]])
+    return SurveyRows(
+        source=folder / "map.osm",
+        lane_id=("a",),
+        lane_type=np.array([0]),
+        lane_points=(np.array([[0.0, 0, 0], [0, 50, 0]]),),
+        sign_id=("one", "two"),
+        sign_shape=np.array([polygon.RECTANGLE, polygon.OCTAGON]),
+        sign_code=("US:R2-1", None),
+        sign_corners=(corners, np.array([[5.0, 5, 2]])),
+    )
+
+
+def test_a_survey_comes_with_the_first_journey_or_alone(tmp_path: Path):
+    rig = foreign.write_rig(tmp_path / "car")
+    survey = Parts(survey=survey_rows(tmp_path), origin=ORIGIN)
+    drive = compose([*parts_of(tmp_path), survey], SAID, rig=rig)
+    write_new(tmp_path / "DATA", drive)
+    found = read_survey(tmp_path / "DATA" / "survey")
+    assert (found.origin, found.lane_id, found.sign_id) == (ORIGIN, ("a",), ("one", "two"))
+    assert found.signs.has_corners.tolist() == [True, False]
+    assert found.signs.center_world[1].tolist() == [5, 5, 2]
+    with pytest.raises(InputError, match="a data set has one survey"):
+        add_to(tmp_path / "DATA", replace(drive, journey_id="second"))
+    with pytest.raises(InputError, match="both give the survey"):
+        compose([*parts_of(tmp_path), survey, survey], SAID, rig=rig)
+    write_survey_alone(tmp_path / "SURVEY", [survey])
+    assert read_survey(tmp_path / "SURVEY").sign_id == found.sign_id
+    with pytest.raises(InputError, match="exists already"):
+        write_survey_alone(tmp_path / "SURVEY", [survey])
+    with pytest.raises(InputError, match=r"DATA is no map \(it has no map\.json\)"):
+        write_survey_alone(tmp_path / "DATA", [survey], overwrite=True)
+
+
+def test_a_survey_that_breaks_the_format_leaves_nothing(tmp_path: Path):
+    rows = survey_rows(tmp_path)
+    twice = replace(rows, sign_id=("one", "one"))
+    with pytest.raises(
+        InputError, match=r"map\.osm/signs\.parquet: row 1: .*'one' stands in row 0 too"
+    ):
+        write_survey_alone(tmp_path / "SURVEY", [Parts(survey=twice, origin=ORIGIN)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_survey_can_be_added_to_journeys_without(tmp_path: Path):
+    rig = foreign.write_rig(tmp_path / "car")
+    write_new(tmp_path / "DATA", compose(parts_of(tmp_path), SAID, rig=rig))
+    survey = Parts(survey=survey_rows(tmp_path), origin=ORIGIN)
+    second = compose([*parts_of(tmp_path), survey], SAID, rig=rig, journey_id="second")
+    add_to(tmp_path / "DATA", second)
+    assert len(read_survey(tmp_path / "DATA" / "survey").lane_id) == 1
 
 
 def test_what_is_no_data_set_is_left_alone(tmp_path: Path):
