@@ -74,6 +74,7 @@ def _add_conventions(group: argparse._ArgumentGroup) -> None:
         metavar=("X", "Y", "Z"),
         help="place of a camera that looks straight ahead, in those axes [m]",
     )
+    group.add_argument("--drive", metavar="NAME", help="the drive of a source with several")
     group.add_argument("--camera", metavar="NAME", help="the camera of a log with several")
     group.add_argument(
         "--camera-height",
@@ -181,6 +182,7 @@ def _asked(options: argparse.Namespace) -> Asked:
         time_offset_s=options.time_offset,
         sign_names=options.sign_names,
         skip_unknown_signs=options.skip_unknown_signs,
+        drive=options.drive,
         camera=options.camera,
         camera_height=options.camera_height,
         heading=options.heading,

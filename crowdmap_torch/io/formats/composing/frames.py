@@ -50,7 +50,7 @@ def find_frames(
     numbered = track
     if track.frame_number is None:
         numbered = replace(track, frame_number=np.arange(len(track.t_ns)) + first_frame)
-    if key is None and not images:
+    if not images and key in (None, NUMBER, *TIME_UNITS):
         return Frames(numbered, {})
     if key is None:
         raise InputError(

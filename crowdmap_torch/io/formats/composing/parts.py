@@ -140,6 +140,8 @@ class Asked:
     sign_names: Path | None = None
     """A table of names beside the package's own."""
     skip_unknown_signs: bool = False
+    drive: str | None = None
+    """The drive of a source with several."""
     camera: str | None = None
     """The sensor of a log with several."""
     camera_height: float | None = None

@@ -98,7 +98,8 @@ def test_a_file_says_the_times(tmp_path: Path):
         find_frames(TRACK, ["a.png"], key=str(listed))
 
 
-def test_without_detections_rows_are_frames():
-    frames = find_frames(TRACK, [], key=None)
+@pytest.mark.parametrize("key", [None, "number", "ns"])
+def test_without_detections_rows_are_frames(key: str | None):
+    frames = find_frames(TRACK, [], key=key)
     assert frames.track.frame_number is not None
     assert len(frames.track.frame_number) == len(TRACK.t_ns) and not frames.of_image
