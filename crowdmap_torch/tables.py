@@ -163,6 +163,34 @@ class Journey:
         """How many frames the journey has."""
         return len(self.frame_number)
 
+    def with_frames(self, frames: Int[Tensor, " k"]) -> Journey:
+        """The journey with these of its frames, by row, each with all that was detected in it; one may come again."""
+
+        def rows_of(frame: Tensor) -> tuple[Tensor, Tensor]:
+            new, row = torch.nonzero(frame == frames[:, None], as_tuple=True)
+            return row, new
+
+        def of_frames(of_each: Tensor | None) -> Tensor | None:
+            return None if of_each is None else of_each[frames]
+
+        sign_row, sign_frame = rows_of(self.signs.frame)
+        lane_row, lane_frame = rows_of(self.lanes.frame)
+        detection, point = torch.nonzero(
+            self.lane_points.detection == lane_row[:, None], as_tuple=True
+        )
+        return replace(
+            self,
+            frame_number=self.frame_number[frames],
+            t_ns=self.t_ns[frames],
+            T_world_camera=self.T_world_camera[frames],
+            sigma_position=of_frames(self.sigma_position),
+            sigma_rotation=of_frames(self.sigma_rotation),
+            signs=replace(self.signs[sign_row], frame=sign_frame, row=torch.arange(len(sign_row))),
+            lanes=replace(self.lanes[lane_row], frame=lane_frame, row=torch.arange(len(lane_row))),
+            lane_points=replace(self.lane_points[point], detection=detection),
+            dropped={},
+        )
+
     def to(self, device: torch.device | str) -> Journey:
         """The same journey on another device."""
         return to_device(self, device)

@@ -25,6 +25,20 @@ def station(T_world_camera: Float[Tensor, "f 4 4"], *, half_window: int = 7) -> 
     return torch.cat((speed.new_zeros(1), ((speed[1:] + speed[:-1]) / 2).cumsum(0)))[: last + 1]
 
 
+def passes(
+    T_world_camera: Float[Tensor, "f 4 4"], *, near_m: float = 15.0, way_m: float = 50.0
+) -> list[slice]:
+    """The frames in pieces none of which comes back to a place, `near_m` from it, after `way_m` or more."""
+    position, way = T_world_camera[:, :2, 3].contiguous(), station(T_world_camera)
+    starts, start = [0], 0
+    for frame in range(1, len(position)):
+        before = position[start:frame][way[start:frame] < way[frame] - way_m]
+        if len(before) and float((before - position[frame]).square().sum(-1).min()) < near_m**2:
+            start = frame
+            starts.append(frame)
+    return [slice(*ends) for ends in zip(starts, [*starts[1:], len(position)], strict=True)]
+
+
 def motion(
     T_world_camera: Float[Tensor, "f 4 4"], t_ns: Int[Tensor, " f"]
 ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:

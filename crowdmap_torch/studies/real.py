@@ -1,16 +1,20 @@
-"""Real drives: KITTI's with the traffic signs of Chawla et al. (IROS 2020), one journey each."""
+"""Real drives: KITTI's with the traffic signs of Chawla et al. (IROS 2020): as they are, cut into passes, and as crowds."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
 
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.studies.chapter import Chapter, Table
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.maps import OURS, PAPER
 from crowdmap_torch.studies.numbers import number
+from crowdmap_torch.studies.passes import COPIES, MeasureDrives
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureReal, Task
 
@@ -23,14 +27,22 @@ _NUMBERS = {
     "95 % [m]": "absolute_center.total.p95",
     "relative, mean [m]": "relative_center.total.mean",
 }
+_CALIBRATIONS = {"found": OURS, "as given": replace(OURS, calibration=CalibrationConfig.off())}
+_CROWDS = {
+    "alone": "each pass by itself",
+    "passes": "all passes together",
+    "copies": f"{COPIES} copies of a pass",
+}
 _SIGNS = {"journey": "one journey's signs", "heads": "cluster heads", "map": "adjusted"}
 
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
-    """Each sequence by each method."""
+    """Each sequence by each method, and the passes that it is cut into, alone and as crowds."""
     for config in _METHODS.values():
         for task in _drives(settings, config):
             yield 0, task
+    for _, task in _crowds(settings):
+        yield 1, task
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
@@ -66,18 +78,85 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             f"sign centres within {GATE_M:g} m. A sign that was passed twice counts by its better pass among one journey's "
             "signs, by both passes together in the heads and after adjustment. Boxes are not exact corners, and there is "
             "one journey in each sequence. Chawla et al. give 0.26 and 0.39 m of mean relative error, with poses "
-            "estimated from the video.",
+            "estimated from the video. A pass is a piece of a sequence that does not come back to a place. Local errors: "
+            "the sign in the adjusted cameras of the frames that it was surveyed from; means over the signs that both have.",
         ),
-        tables=(Table("real", columns, tuple(rows)),),
+        tables=(Table("real", columns, tuple(rows)), *_of_crowds(settings, folder)),
     )
+
+
+def _of_crowds(settings: Settings, folder: StudyFolder) -> Iterator[Table]:
+    """The passes' signs in the cameras that they were surveyed from, by themselves and mapped together."""
+    rows, every = [], {}
+    for calibration, task in _crowds(settings):
+        if not folder.has_result(task.key):
+            continue
+        result = folder.read_result(task.key)
+        single, final = result["single"], result["map"]
+        both = [(single[name], final[name]) for name in sorted(single.keys() & final.keys())]
+        every.setdefault((task.crowd, task.errors, calibration), []).extend(both)
+        relative = [_mean([one[name] for one in result["relative"]]) for name in ("single", "map")]
+        what = (_CROWDS[task.crowd], task.errors, calibration, task.dataset.name)
+        rows.append((*what, result["drives"], *_local(both), *relative, result["seconds"]))
+    for (crowd, errors, calibration), both in every.items():
+        nothing = (float("nan"),) * 3
+        rows.append((_CROWDS[crowd], errors, calibration, "all", "", *_local(both), *nothing))
+    if rows:
+        columns = (
+            *("drives", "pose errors", "calibration", "sequence", "number", "signs"),
+            *("single drives, local [m]", "adjusted, local [m]"),
+            *("single drives, relative [m]", "adjusted, relative [m]", "seconds of a core"),
+        )
+        yield Table("passes", columns, tuple(sorted(rows, key=lambda row: row[:4])))
+
+
+def _mean(errors: list[float | None]) -> float:
+    """Of those maps that have a relative error: one of a single sign has none."""
+    known = [error for error in errors if error is not None]
+    return fmean(known) if known else float("nan")
+
+
+def _local(both: list[tuple[float, float]]) -> tuple[float, ...]:
+    """How many signs, and the means of both errors."""
+    if not both:
+        return 0, float("nan"), float("nan")
+    return len(both), fmean(a for a, _ in both), fmean(b for _, b in both)
+
+
+def _crowds(settings: Settings) -> Iterator[tuple[str, MeasureDrives]]:
+    """The drives that sequences are made into, by what their calibration is."""
+    if settings.real is None:
+        return
+    surveyed_from = settings.real / "surveyed_from.json"
+    if not surveyed_from.is_file():
+        return
+    errors = ("none", "simulated", *(["recorded"] if settings.recorded else []))
+    for path in _sequences(settings.real):
+        for calibration, config in _CALIBRATIONS.items():
+            # A sign that one pass saw is a sign.
+            alone = replace(config, crowd=replace(config.crowd, min_journeys=1))
+            yield calibration, MeasureDrives(path, surveyed_from, GATE_M, "alone", config=alone)
+            if calibration != "found":
+                continue
+            for kind in errors:
+                for crowd, how in (("passes", alone), ("copies", config)):
+                    task = MeasureDrives(
+                        *(path, surveyed_from, GATE_M, crowd, kind, settings.recorded, how)
+                    )
+                    yield calibration, task
+
+
+def _sequences(real: Path) -> list[Path]:
+    folders = sorted(path.parent for path in real.glob("*/dataset.json"))
+    if not folders:
+        raise InputError(f"{real}: no dataset in it; expected folders with dataset.json")
+    return folders
 
 
 def _drives(settings: Settings, config: MapperConfig) -> list[MeasureReal]:
     if settings.real is None:
         return []
-    folders = sorted(path.parent for path in settings.real.glob("*/dataset.json"))
-    if not folders:
-        raise InputError(f"{settings.real}: no dataset in it; expected folders with dataset.json")
+    folders = _sequences(settings.real)
     # There is one journey in each: what it saw alone is the map.
     alone = replace(config, crowd=replace(config.crowd, min_journeys=1))
     return [MeasureReal(path, settings.real / "eligible.json", GATE_M, alone) for path in folders]

@@ -26,6 +26,8 @@ class Settings:
     scale: Scale
     real: Path | None
     """Folder of real drives."""
+    recorded: Path | None = None
+    """Segment of comma2k19 with a receiver's errors."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +62,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--real", type=Path, metavar="DIR", help="folder of kitti-signs")
     parser.add_argument(
+        "--recorded-errors",
+        type=Path,
+        metavar="DIR",
+        help="segment of comma2k19 whose receiver's errors are laid over the real drives",
+    )
+    parser.add_argument(
         "--report-only", action="store_true", help="tables and plots of what is done, no more work"
     )
 
 
 def run_studies(name: str, studies: Sequence[Study], options: argparse.Namespace) -> None:
     """Does what is not done yet of all studies, seed after seed, and writes one page."""
-    settings = Settings(QUICK if options.quick else FULL, options.real)
+    settings = Settings(QUICK if options.quick else FULL, options.real, options.recorded_errors)
     folder = StudyFolder(options.out / "quick" if options.quick else options.out)
     turns = [turn for study in studies for turn in study.tasks(settings)]
     tasks = [task for _, task in sorted(turns, key=lambda turn: turn[0])]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.geometry.trajectory import station
+from crowdmap_torch.geometry.trajectory import passes, station
 
 F64 = torch.float64
 
@@ -43,3 +43,32 @@ def test_few_frames(frames):
     way = station(at(place))
     assert way.shape == (frames,)
     assert way.tolist() == pytest.approx([3**0.5 * k for k in range(frames)])
+
+
+def lap(length_m: float) -> torch.Tensor:
+    """Poses every metre along a round of 400 m."""
+    angle = torch.arange(int(length_m), dtype=F64) * (2 * torch.pi / 400)
+    place = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=-1)
+    return at(400 / (2 * torch.pi) * place)
+
+
+def test_a_trajectory_that_comes_back_is_cut_where_it_does():
+    T = lap(1000)
+    found = passes(T)
+    assert [piece.start for piece in found] == [0, *(piece.stop for piece in found[:-1])]
+    assert found[-1].stop == len(T)
+    # 15 m before a round is full, to a metre: ways are smoothed at their ends.
+    assert len(found) == 3
+    assert all(abs(piece.stop - piece.start - 386) <= 2 for piece in found[:-1])
+    for piece in found:
+        place, way = T[piece, :2, 3], station(T)[piece]
+        near = (place[:, None] - place).norm(dim=-1) < 15
+        assert float((way[:, None] - way).abs()[near].max()) <= 50
+
+
+def test_a_car_that_stands_does_not_come_back():
+    place = torch.zeros(300, 3, dtype=F64)
+    place[:100, 0] = torch.arange(100)
+    place[100:, 0] = 99
+    assert passes(at(place)) == [slice(0, 300)]
+    assert passes(at(place[:1])) == [slice(0, 1)]

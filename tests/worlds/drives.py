@@ -68,32 +68,11 @@ def make_journey(
 
 
 def with_frames(journey: Journey, frames: Tensor) -> Journey:
-    """The journey with these of its frames, each with all that was detected in it; a frame may come again."""
-
-    def rows_of(frame: Tensor) -> tuple[Tensor, Tensor]:
-        new, row = torch.nonzero(frame == frames[:, None], as_tuple=True)
-        return row, new
-
-    sign_row, sign_frame = rows_of(journey.signs.frame)
-    lane_row, lane_frame = rows_of(journey.lanes.frame)
-    lanes = replace(journey.lanes[lane_row], frame=lane_frame, row=torch.arange(len(lane_row)))
-    signs = replace(journey.signs[sign_row], frame=sign_frame, row=torch.arange(len(sign_row)))
-    detection, point = torch.nonzero(
-        journey.lane_points.detection == lane_row[:, None], as_tuple=True
-    )
-    sigma = (journey.sigma_position, journey.sigma_rotation)
-    sigma_position, sigma_rotation = (None if s is None else s[frames] for s in sigma)
+    """The journey with these of its frames, numbered and timed anew."""
     return replace(
-        journey,
+        journey.with_frames(frames),
         frame_number=torch.arange(len(frames)),
         t_ns=journey.t_ns[0] + torch.arange(len(frames)) * 125_000_000,
-        T_world_camera=journey.T_world_camera[frames],
-        sigma_position=sigma_position,
-        sigma_rotation=sigma_rotation,
-        signs=signs,
-        lanes=lanes,
-        lane_points=replace(journey.lane_points[point], detection=detection),
-        dropped={},
     )
 
 
