@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import group_count, group_median
+from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_median
 from crowdmap_torch.ranges import Count, Degrees, Deviations, Length, Settings, Share
 from crowdmap_torch.tables import Signs
 
@@ -40,6 +40,14 @@ class OutlierJourneyConfig(Settings):
     """Largest step between two frames beyond what a car can drive [m]."""
 
 
+_LEAST_JOURNEYS = 3
+"""Of two that differ nobody can say which is wrong."""
+_OF_MEDIAN = 1.2533
+"""Standard error of a median over that of a mean."""
+_LEAST_COMMON = 3
+"""Signs that a journey has in common with others at least before their median says how they differ."""
+
+
 @dataclass(frozen=True)
 class OutlierJourney:
     """A journey that does not fit the others, and why."""
@@ -50,7 +58,7 @@ class OutlierJourney:
 
 @dataclass(frozen=True)
 class JourneyStatistics:
-    """How each journey fits the crowd; NaN where it has no sign to tell."""
+    """How each journey fits the crowd; NaN where it has no sign, or too few in common with others, to tell."""
 
     signs: Int[Tensor, " j"]
     """Signs triangulated."""
@@ -70,6 +78,10 @@ class JourneyStatistics:
     """Largest drift along it [m]."""
     leap: Float[Tensor, " j"]
     """Largest step between two frames beyond what a car can drive [m]."""
+    turn_error: Float[Tensor, " j"]
+    """What is left to chance in `turn`, as few signs say little of it (1-sigma) [rad]."""
+    roll_error: Float[Tensor, " j"]
+    stretch_error: Float[Tensor, " j"]
 
 
 def journey_statistics(
@@ -92,6 +104,22 @@ def journey_statistics(
     number = group_count(signs.journey, journeys)
     checked = group_count(signs.journey[company], journeys)
     matched = group_count(signs.journey[company & used], journeys) / checked.clamp_min(1)
+    # What nobody else saw is its own head.
+    of, _, _ = distinct_pairs(label[used], member.journey)
+    common = (group_count(of, len(heads)) > 1)[label[used]]
+    of_common = member.journey[common]
+    count = group_count(of_common, journeys)
+
+    def median(of_each: Float[Tensor, " m"]) -> Float[Tensor, " j"]:
+        found = group_median(of_each[common], of_common, journeys)
+        return torch.where(count >= _LEAST_COMMON, found, torch.nan)
+
+    def error(of_each: Float[Tensor, " m"]) -> Float[Tensor, " j"]:
+        off = (of_each[common] - median(of_each)[of_common]).abs()
+        several = off[off.isfinite()]
+        spread = 1.4826 * several.median() if len(several) else several.sum()
+        return _OF_MEDIAN * spread / (count - 1).clamp_min(1).sqrt()
+
     miss = (member.center_world - head.center_world).norm(dim=1)
     a, b = member.normal_world, head.normal_world
     turn = torch.atan2(b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0], (a[:, :2] * b[:, :2]).sum(1))
@@ -104,12 +132,15 @@ def journey_statistics(
         signs=number,
         matched=torch.where(checked > 0, matched, torch.nan),
         bias=(translation - centre).norm(dim=1),
-        scatter=group_median(miss, member.journey, journeys),
-        turn=group_median(turn, member.journey, journeys),
-        roll=group_median(roll, member.journey, journeys),
-        stretch=group_median(stretch, member.journey, journeys),
+        scatter=median(miss),
+        turn=median(turn),
+        roll=median(roll),
+        stretch=median(stretch),
         drift=drift,
         leap=leap,
+        turn_error=error(turn),
+        roll_error=error(roll),
+        stretch_error=error(stretch),
     )
 
 
@@ -118,7 +149,7 @@ def find_outlier_journeys(
 ) -> tuple[OutlierJourney, ...]:
     """Journeys that do not fit, each with its reasons; with fewer than three journeys only a leap can tell."""
     judged = statistics.signs >= config.min_signs
-    if int(judged.sum()) < 3:
+    if int(judged.sum()) < _LEAST_JOURNEYS:
         judged = torch.zeros_like(judged)
     usual = statistics.matched[judged].nanmedian()
     few = judged & (statistics.matched < config.min_matched * usual)
@@ -133,17 +164,17 @@ def find_outlier_journeys(
             "its signs miss the others' by {:.2f} m after its bias is taken off",
         ),
         (
-            outlying(s.turn, radian * config.min_turn_deg),
+            outlying(s.turn, radian * config.min_turn_deg, error=s.turn_error),
             torch.rad2deg(s.turn),
             "its signs are turned by {:.1f} degrees against the others'",
         ),
         (
-            outlying(s.roll, radian * config.min_roll_deg),
+            outlying(s.roll, radian * config.min_roll_deg, error=s.roll_error),
             torch.rad2deg(s.roll),
             "its signs are rolled by {:.1f} degrees against the others'",
         ),
         (
-            outlying(s.stretch, config.min_stretch),
+            outlying(s.stretch, config.min_stretch, error=s.stretch_error),
             s.stretch.exp(),
             "its signs are {:.2f} times the size the others see",
         ),
@@ -162,12 +193,19 @@ def find_outlier_journeys(
 
 
 def _outlying(
-    value: Float[Tensor, " j"], floor: float, *, judged: Bool[Tensor, " j"], spread: float
+    value: Float[Tensor, " j"],
+    floor: float,
+    *,
+    judged: Bool[Tensor, " j"],
+    spread: float,
+    error: Float[Tensor, " j"] | None = None,
 ) -> Bool[Tensor, " j"]:
-    """True where a figure is above `floor` and far from those of the crowd."""
+    """True where a figure is above `floor` and far from those of the crowd, by their spread and its own `error`."""
     known = value[judged & value.isfinite()]
-    if not len(known):
+    if len(known) < _LEAST_JOURNEYS:
         return torch.zeros_like(judged)
     centre = known.median()
     scale = 1.4826 * (known - centre).abs().median()
+    if error is not None:
+        scale = (scale.square() + error.square()).sqrt()
     return judged & ((value - centre).abs() > spread * scale) & (value.abs() > floor)

@@ -35,6 +35,9 @@ def calm() -> JourneyStatistics:
         stretch=0.1 * small,
         drift=0.2 + small,
         leap=0 * small,
+        turn_error=0 * small,
+        roll_error=0 * small,
+        stretch_error=0 * small,
     )
 
 
@@ -100,15 +103,19 @@ def test_naming_does_not_depend_on_the_order_of_journeys():
     assert int(order[found.journey]) == 3
 
 
-def statistics_of(company: Tensor | None = None, **changes: Tensor) -> JourneyStatistics:
-    """Of two journeys with two signs each, on the heads; those of journey 1 changed."""
-    places = [(0.0, 0.0, 3.0), (50.0, 0.0, 3.0)]
-    signs, heads = signs_at(places * 2, [0, 0, 1, 1]), signs_at(places, [-1, -1])
+PLACES = [(0.0, 0.0, 3.0), (50.0, 0.0, 3.0), (80.0, 0.0, 3.0)]
+
+
+def statistics_of(
+    company: Tensor | None = None, label: tuple[int, ...] = (0, 1, 2, 0, 1, 2), **changes: Tensor
+) -> JourneyStatistics:
+    """Of two journeys with three signs each, on the heads; those of journey 1 changed."""
+    signs = signs_at(PLACES * 2, [0, 0, 0, 1, 1, 1])
     return journey_statistics(
         replace(signs, **changes),
-        torch.tensor([0, 1, 0, 1]),
-        heads,
-        torch.ones(4, dtype=torch.bool) if company is None else company,
+        torch.tensor(label),
+        signs_at([*PLACES, PLACES[-1]], [-1] * 4),
+        torch.ones(6, dtype=torch.bool) if company is None else company,
         torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]).double(),
         torch.zeros(2).double(),
         torch.zeros(2).double(),
@@ -117,7 +124,7 @@ def statistics_of(company: Tensor | None = None, **changes: Tensor) -> JourneySt
 
 def test_signs_on_their_heads_have_figures_of_zero():
     found = statistics_of()
-    assert found.signs.tolist() == [2, 2] and found.matched.tolist() == [1, 1]
+    assert found.signs.tolist() == [3, 3] and found.matched.tolist() == [1, 1]
     for column in ("scatter", "turn", "roll", "stretch"):
         assert getattr(found, column).tolist() == [0, 0], column
     # Of two, the median is the first.
@@ -127,8 +134,8 @@ def test_signs_on_their_heads_have_figures_of_zero():
 @pytest.mark.parametrize(("axis", "column"), [((0.0, 1.0, 0.0), "turn"), ((0.0, 0.0, 1.0), "roll")])
 def test_turns_of_signs_are_told_apart(axis: tuple[float, float, float], column: str):
     angle = math.radians(3)
-    T = signs_at([(0.0, 0.0, 3.0), (50.0, 0.0, 3.0)] * 2, [0, 0, 1, 1]).T_world_sign.clone()
-    T[2:, :3, :3] = T[2:, :3, :3] @ se3.so3_exp(angle * torch.tensor(axis).double())
+    T = signs_at(PLACES * 2, [0, 0, 0, 1, 1, 1]).T_world_sign.clone()
+    T[3:, :3, :3] = T[3:, :3, :3] @ se3.so3_exp(angle * torch.tensor(axis).double())
     found = statistics_of(T_world_sign=T)
     assert getattr(found, column).tolist() == pytest.approx([0, angle], abs=1e-9)
     other = {"turn": "roll", "roll": "turn"}[column]
@@ -136,5 +143,48 @@ def test_turns_of_signs_are_told_apart(axis: tuple[float, float, float], column:
 
 
 def test_what_nobody_else_passed_by_does_not_count_as_unmatched():
-    found = statistics_of(torch.tensor([True, False, False, False]))
+    found = statistics_of(torch.tensor([True, *[False] * 5]))
     assert found.matched[0] == 1 and found.matched[1].isnan()
+
+
+def test_what_few_signs_say_that_others_saw_too_is_not_judged():
+    # The third sign of each is its own head.
+    found = statistics_of(label=(0, 1, 2, 0, 1, 3))
+    for column in ("scatter", "turn", "roll", "stretch"):
+        assert getattr(found, column).isnan().all(), column
+
+
+def test_of_two_figures_none_is_an_outlier():
+    roll = torch.full((JOURNEYS,), torch.nan).double()
+    roll[:2] = torch.tensor([0.0, math.radians(9)])
+    assert find_outlier_journeys(replace(calm(), roll=roll), CONFIG) == ()
+    roll[2] = 0.0
+    (found,) = find_outlier_journeys(replace(calm(), roll=roll), CONFIG)
+    assert found.journey == 1
+
+
+@pytest.mark.parametrize(("signs", "accused"), [(5, False), (60, True)])
+def test_a_figure_of_few_signs_that_scatter_accuses_nobody(signs: int, accused: bool):
+    generator = torch.Generator().manual_seed(4)
+    n = 4 * signs
+    places = [(5.0 * k, 0.0, 3.0) for k in range(signs)]
+    rolled = 2.5 * torch.randn(n, generator=generator, dtype=torch.float64)
+    # The last of four drives has its camera rolled.
+    rolled[3 * signs :] += 4.0 - rolled[3 * signs :].median()
+    turn = torch.zeros(n, 3, dtype=torch.float64)
+    turn[:, 2] = torch.deg2rad(rolled)
+    all_signs = signs_at(places * 4, [j for j in range(4) for _ in range(signs)])
+    T = all_signs.T_world_sign.clone()
+    T[:, :3, :3] = T[:, :3, :3] @ se3.so3_exp(turn)
+    nothing = torch.zeros(4, dtype=torch.float64)
+    found = journey_statistics(
+        replace(all_signs, T_world_sign=T),
+        torch.arange(signs).repeat(4),
+        signs_at(places, [-1] * signs),
+        torch.ones(n, dtype=torch.bool),
+        torch.zeros(4, 3, dtype=torch.float64),
+        nothing,
+        nothing,
+    )
+    named = [o.journey for o in find_outlier_journeys(found, CONFIG) if "rolled" in o.reason]
+    assert named == ([3] if accused else [])
