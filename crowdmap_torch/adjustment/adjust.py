@@ -39,7 +39,7 @@ from crowdmap_torch.noise.pose_prior import DriftNodes, drift_nodes, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm
-from crowdmap_torch.optim.solvers.normal_equations import MapBackend
+from crowdmap_torch.optim.solvers.normal_equations import MapBackend, MapEquations
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.residuals.lane import lane_prior, lane_stretch
 from crowdmap_torch.residuals.sign_prior import against_the_drive, habit_term, sign_place
@@ -226,9 +226,18 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
     first come to rest, and when the solver stops. It is finished when that changes nothing.
     """
-    state = lm.step(bundle.problem(), state, bundle.config.lm, backend=backend)
+    problem = bundle.problem()
+    normal = state.normal
+    if not isinstance(normal, MapEquations):
+        normal = backend.assemble(problem, state.values)
+        state = replace(state, normal=normal, linearizations=state.linearizations + 1)
+    state = lm.step(problem, state, bundle.config.lm, backend=backend)
     if not bool(state.accepted.all()):
         return state, state.done
+    changes = bundle.prior.sampled_changes()
+    if len(changes.pair):
+        variance = normal.variance_of_changes(changes)
+        bundle.drift_told.copy_(bundle.prior.told(changes, variance, bundle.prior_scale))
     bundle.fold(dict(state.values))
     at_rest = bundle.refresh()
     if at_rest and (state.done or int(bundle.judged) == 0):

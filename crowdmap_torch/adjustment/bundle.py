@@ -94,6 +94,8 @@ class Bundle(nn.Module):
     """Detections, by number, that have no say."""
     prior_scale: Tensor
     """By journey, how far bias, drift and rotation are from the sigmas of `prior`."""
+    drift_told: Tensor
+    """By journey and number of a pose, the share of the drift's changes that observations tell."""
 
     def __init__(
         self, unknowns: Unknowns, observations: Observations, priors: Priors, config: AdjustConfig
@@ -119,6 +121,7 @@ class Bundle(nn.Module):
         self.register_buffer("given_up", given_up)
         self.register_buffer("judged", torch.zeros_like(given_up, dtype=torch.long).sum())
         self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
+        self.register_buffer("drift_told", torch.ones_like(values["bias"]))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points
         self.lenses = observations.lenses
@@ -217,7 +220,7 @@ class Bundle(nn.Module):
             self.match_valid = found.valid
         self.relinearise()
         at_rest = self._narrow(values)
-        rescaled = self.prior.rescaled(values["drift"], self.prior_scale)
+        rescaled = self.prior.rescaled(values["drift"], self.prior_scale, self.drift_told)
         moved = (rescaled / self.prior_scale).log().abs() > _SCALE_RESTS
         # Within that they stay as they are, to the last digit: the cost is to fall from step to step.
         self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))

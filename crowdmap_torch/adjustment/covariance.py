@@ -50,7 +50,7 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
     values = bundle.values()
     nodes = bundle.prior.nodes
     journeys = len(values["bias"])
-    expected = bundle.prior.expected_scale(values["drift"], bundle.prior_scale)
+    expected = bundle.prior.expected_scale(values["drift"], bundle.prior_scale, bundle.drift_told)
     covariance = bundle.backend().assemble(bundle.information(expected), values).covariance()
     to_bias = _to_bias(values["pose"][nodes.first])
     count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)

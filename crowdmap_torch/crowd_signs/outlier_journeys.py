@@ -44,6 +44,8 @@ _LEAST_JOURNEYS = 3
 """Of two that differ nobody can say which is wrong."""
 _OF_MEDIAN = 1.2533
 """Standard error of a median over that of a mean."""
+_BY_CHANCE = 3.0
+"""Standard errors that a median of a journey's signs may be off by."""
 _LEAST_COMMON = 3
 """Signs that a journey has in common with others at least before their median says how they differ."""
 
@@ -205,7 +207,7 @@ def _outlying(
     if len(known) < _LEAST_JOURNEYS:
         return torch.zeros_like(judged)
     centre = known.median()
-    scale = 1.4826 * (known - centre).abs().median()
+    usual = (spread * 1.4826 * (known - centre).abs().median()).expand_as(value)
     if error is not None:
-        scale = (scale.square() + error.square()).sqrt()
-    return judged & ((value - centre).abs() > spread * scale) & (value.abs() > floor)
+        usual = (usual.square() + (_BY_CHANCE * error).square()).sqrt()
+    return judged & ((value - centre).abs() > usual) & (value.abs() > floor)

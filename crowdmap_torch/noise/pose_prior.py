@@ -18,6 +18,7 @@ from torch import Tensor
 
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
 from crowdmap_torch.tables import Journey
@@ -136,39 +137,68 @@ class PosePrior:
             ),
         }
 
+    def sampled_changes(self) -> ChainChanges:
+        """Some of the changes that scales are told by, spread over each journey: as many as are solved for at once."""
+        journey = self.nodes.journey[self.far[:, 0]]
+        _, of, count = torch.unique_consecutive(journey, return_inverse=True, return_counts=True)
+        rank = torch.arange(len(of), device=of.device) - (count.cumsum(0) - count)[of]
+        column = torch.where(count[of] > _SAMPLED, rank * _SAMPLED // count[of], rank)
+        starts = torch.ones_like(column, dtype=torch.bool)
+        starts[1:] = (column[1:] != column[:-1]) | (of[1:] != of[:-1])
+        return ChainChanges(self.far[starts], column[starts])
+
+    def told(
+        self, changes: ChainChanges, variance: Float[Tensor, "q 6"], scale: Float[Tensor, "j 3"]
+    ) -> Float[Tensor, "j 6"]:
+        """By journey and number of a pose, the share of changes that observations tell, not the prior at this `scale`.
+
+        `variance` is what is left of each change when all is observed: of a change that nothing tells of, the prior's own
+        (MacKay, Bayesian Interpolation, 1992: the effective number of well determined parameters).
+        """
+        journey = self.nodes.journey[changes.pair[:, 0]]
+        of_each = scale[:, 1:].repeat_interleave(3, dim=1)[journey].square()
+        share = 1 - variance / (of_each * self._expected(changes.pair))
+        total = share.new_zeros(len(scale), 6).index_add_(0, journey, share.clamp(0, 1))
+        return total / torch.bincount(journey, minlength=len(scale)).clamp_min(1)[:, None]
+
     def rescaled(
-        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"]
+        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"], told: Float[Tensor, "j 6"]
     ) -> Float[Tensor, "j 3"]:
         """By journey, what the sigmas of its bias, of its drift and of its rotation are to be multiplied by.
 
         `drift` is the estimated one. What all journeys share is taken off, and costs its degrees of freedom (restricted
-        maximum likelihood); a journey's scale is drawn towards the fleet's, and that towards one.
+        maximum likelihood); a journey's scale is drawn towards the fleet's, and that towards one. Changes count as far as
+        observations have `told` them: an estimate follows the prior where nothing is seen, and says nothing of it.
         """
-        return self._scales(drift, scale)[0]
+        return self._scales(drift, scale, told)[0]
 
     def expected_scale(
-        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"]
+        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"], told: Float[Tensor, "j 6"]
     ) -> Float[Tensor, "j 3"]:
         """`rescaled` as covariances need it: the root of the mean that a scale's square has, not of its median.
 
         A variance found from few numbers may well be larger than it seems: what rests on it has Student's covariance,
         wider than a normal's by `n / (n - 2)` of n degrees of freedom (Gelman et al., Bayesian Data Analysis, 3.2).
         """
-        found, wider = self._scales(drift, scale)
+        found, wider = self._scales(drift, scale, told)
         return found * wider.sqrt()
 
+    def _expected(self, pair: Int[Tensor, "q 2"]) -> Float[Tensor, "q 6"]:
+        """Mean squares of the drift's changes between nodes, by the sigmas as given."""
+        first, second = pair.unbind(1)
+        own = self.nodes.journey[first]
+        gap = (self.nodes.way[second] - self.nodes.way[first])[:, None]
+        return -2 * torch.expm1(-gap / self.length_m[own]) * self.drift_sigma[own].square()
+
     def _scales(
-        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"]
+        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"], told: Float[Tensor, "j 6"]
     ) -> tuple[Float[Tensor, "j 3"], Float[Tensor, "j 3"]]:
         """The scales, and for each the mean of its square over the median."""
         journeys, own = len(scale), self.nodes.journey
         first, second = self.far.unbind(1)
-        change = (drift[second] - drift[first]).square()
-        gap = (self.nodes.way[second] - self.nodes.way[first])[:, None]
-        expected = -2 * torch.expm1(-gap / self.length_m[own[first]])
-        change = change / (expected * self.drift_sigma[own[first]].square())
+        change = (drift[second] - drift[first]).square() / self._expected(self.far)
         changes = drift.new_zeros(journeys, 6).index_add_(0, own[first], change)
-        pairs = torch.bincount(own[first], minlength=journeys).to(drift)[:, None].expand(-1, 3)
+        pairs = torch.bincount(own[first], minlength=journeys).to(drift)[:, None] * told
         count = torch.bincount(own, minlength=journeys).to(drift)[:, None]
         slow = self._share_of_mean()
         mean = self.nodes.mean(drift[:, :3], journeys)
@@ -178,10 +208,10 @@ class PosePrior:
         slides, rolls = self.drift_sigma.square().split(3, dim=1)
         for _ in range(_SWEEPS):
             moves, of_moves, moves_wider = self._pooled(
-                likely[1], changes[:, :3], pairs, moves[:, None] * slides
+                likely[1], changes[:, :3], pairs[:, :3], moves[:, None] * slides
             )
             turns, of_turns, turns_wider = self._pooled(
-                likely[2], changes[:, 3:], pairs, turns[:, None] * rolls
+                likely[2], changes[:, 3:], pairs[:, 3:], turns[:, None] * rolls
             )
             spread = (
                 bias[:, None] * self.bias_sigma[:, :3].square() + moves[:, None] * slow * slides
@@ -278,6 +308,8 @@ _LEAST_STRENGTH = 3.0
 """With fewer degrees of freedom a variance has no mean worth the name."""
 _STRENGTH_SPREAD = 1.0
 """1-sigma of the logarithm of the journeys' degrees of freedom about the usual ones."""
+_SAMPLED = 8
+"""Changes of a journey whose variances are asked for, at most."""
 _SWEEPS = 60
 """Alternations between scales and what all journeys share."""
 _SCALES_SQUARED = (0.01, 100.0)

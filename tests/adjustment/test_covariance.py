@@ -46,7 +46,7 @@ def dense(bundle: Bundle):
     """Joint covariance of all unknowns, and the columns of each variable's blocks."""
     with torch.no_grad():
         values = bundle.values()
-        scale = bundle.prior.expected_scale(values["drift"], bundle.prior_scale)
+        scale = bundle.prior.expected_scale(values["drift"], bundle.prior_scale, bundle.drift_told)
         problem = bundle.information(scale)
         normal = DenseBackend().assemble(problem, values)
         covariance = normal.covariance(floor=1e-9).matrix[0]

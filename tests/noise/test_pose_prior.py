@@ -54,6 +54,11 @@ def make_prior(
     )
 
 
+def rescaled(prior: PosePrior, drift: Tensor, scale: Tensor) -> Tensor:
+    """The scales of journeys whose drift is known everywhere."""
+    return prior.rescaled(drift, scale, torch.ones(len(scale), 6, dtype=F64))
+
+
 def drawn_path(prior: PosePrior, scale: Tensor, generator: torch.Generator) -> Tensor:
     """Drift (node, journey, 6) whose sigmas are the given ones times `scale`."""
     bias, sigma = prior._scaled(scale)
@@ -117,7 +122,7 @@ def test_sigmas_of_the_whole_fleet_that_are_wrong_are_found_out(factor):
         prior = make_prior(12)
         scale = torch.full((12, 3), factor, dtype=F64)
         drift = drawn(prior, scale, seed)
-        found.append(prior.rescaled(drift, torch.ones_like(scale)).log().mean(0))
+        found.append(rescaled(prior, drift, torch.ones_like(scale)).log().mean(0))
     found = torch.stack(found).mean(0).exp()
     # 12 journeys have 33 degrees of freedom for the bias, and the sigmas as given count for three: they take a tenth of
     # the way back, and a draw scatters by 12 %. Of drifts there are hundreds.
@@ -132,7 +137,7 @@ def test_one_journey_whose_sigmas_are_wrong_is_told_from_the_others(factor):
         prior = make_prior(12)
         scale = torch.ones(12, 3, dtype=F64)
         scale[4] = factor
-        found.append(prior.rescaled(drawn(prior, scale, seed), torch.ones_like(scale)).log())
+        found.append(rescaled(prior, drawn(prior, scale, seed), torch.ones_like(scale)).log())
     found = torch.stack(found).mean(0).exp()
     others = torch.cat((found[:4], found[5:]))
     assert torch.allclose(others, torch.ones(3, dtype=F64), atol=0.3)
@@ -154,7 +159,7 @@ def test_drives_that_differ_are_each_taken_by_their_own_word(spread: float, boun
         g = torch.Generator().manual_seed(seed)
         log = spread * (2 * torch.rand(20, 1, generator=g, dtype=F64) - 1)
         prior, scale = make_prior(20, way_m=500.0), log.exp().expand(20, 3).contiguous()
-        found = prior.rescaled(drawn(prior, scale, seed), torch.ones_like(scale))
+        found = rescaled(prior, drawn(prior, scale, seed), torch.ones_like(scale))
         squares.append((found.log() - log).square().mean(0))
     rms = torch.stack(squares).mean(0).sqrt()
     assert (rms[1:] < bound).all()
@@ -164,8 +169,46 @@ def test_scales_do_not_depend_on_where_they_start():
     prior = make_prior(6)
     drift = drawn(prior, torch.ones(6, 3, dtype=F64), seed=3)
     ones = torch.ones(6, 3, dtype=F64)
-    first, second = (prior.rescaled(drift, start) for start in (ones, 3 * ones))
+    first, second = (rescaled(prior, drift, start) for start in (ones, 3 * ones))
     torch.testing.assert_close(first, second, rtol=1e-3, atol=0)
+
+
+def test_what_nobody_saw_does_not_narrow_a_scale():
+    """Estimates follow the prior's mean where nothing is seen: a twentieth of the changes is known, the rest is zero."""
+    prior, ones = make_prior(6), torch.ones(6, 3, dtype=F64)
+    drift = math.sqrt(0.05) * drawn(prior, ones, seed=3)
+    blind, seen = (prior.rescaled(drift, ones, share * ones.repeat(1, 2)) for share in (1.0, 0.05))
+    assert (blind[:, 1:] < 0.3).all()
+    assert ((seen[:, 1:] - 1).abs() < 0.25).all()
+    nothing = prior.rescaled(0 * drift, ones, 0 * ones.repeat(1, 2))
+    torch.testing.assert_close(nothing[:, 1:], ones[:, 1:])
+
+
+def test_changes_are_told_by_what_is_left_of_their_variance():
+    prior = make_prior(3)
+    scale = torch.tensor([[1.0, 2.0, 0.5]], dtype=F64).expand(3, 3)
+    changes = prior.sampled_changes()
+    journey = prior.nodes.journey[changes.pair]
+    assert torch.equal(journey[:, 0], journey[:, 1]) and set(journey.flatten().tolist()) == {
+        0,
+        1,
+        2,
+    }
+    gap = (prior.nodes.way[changes.pair[:, 1]] - prior.nodes.way[changes.pair[:, 0]])[:, None]
+    # Of a Gauss-Markov chain, by its sigma and its length.
+    sigma = prior.drift_sigma[journey[:, 0]] * scale[0, 1:].repeat_interleave(3)
+    of_prior = 2 * sigma.square() * (1 - torch.exp(-gap / prior.length_m[journey[:, 0]]))
+    for left, told in ((1.0, 0.0), (0.25, 0.75), (0.0, 1.0), (1.2, 0.0)):
+        found = prior.told(changes, left * of_prior, scale)
+        torch.testing.assert_close(found, torch.full((3, 6), told, dtype=F64))
+
+
+def test_no_more_changes_are_asked_for_than_are_solved_at_once():
+    short, long = (make_prior(2, way_m=way).sampled_changes() for way in (400.0, 9000.0))
+    assert short.columns == 3 and long.columns == 8
+    for changes, most in ((short, 3), (long, 8)):
+        assert torch.bincount(changes.column).tolist() == [2] * most
+    assert make_prior(2, way_m=50.0).sampled_changes().columns == 0
 
 
 def test_a_single_journey_says_nothing_of_its_sigmas():
@@ -173,7 +216,8 @@ def test_a_single_journey_says_nothing_of_its_sigmas():
     scale = torch.full((1, 3), 3.0, dtype=F64)
     drift = drawn(prior, scale, seed=0) + 1.0
     for found in (prior.rescaled, prior.expected_scale):
-        torch.testing.assert_close(found(drift, torch.ones_like(scale)), torch.ones_like(scale))
+        ones = torch.ones_like(scale)
+        torch.testing.assert_close(found(drift, ones, ones.repeat(1, 2)), ones)
 
 
 @pytest.mark.parametrize("journeys", [2, 10])
@@ -186,7 +230,7 @@ def test_what_all_journeys_share_errs_as_much_as_the_expected_scales_say(journey
         path = drawn_path(prior, ones, generator)
         drift = without_common(prior, path, ones)
         for squares, scales in ((found, prior.rescaled), (expected, prior.expected_scale)):
-            bias, slow, _ = scales(drift, ones).square()[..., None].unbind(1)
+            bias, slow, _ = scales(drift, ones, ones.repeat(1, 2)).square()[..., None].unbind(1)
             slow = slow * prior._share_of_mean()
             of_mean = (
                 bias * prior.bias_sigma.square()[:, :3] + slow * prior.drift_sigma.square()[:, :3]

@@ -33,6 +33,7 @@ from crowdmap_torch.optim.solvers.chain_schur import (
 from crowdmap_torch.optim.solvers.layout import Layout
 from crowdmap_torch.optim.solvers.normal_equations import (
     DIAGONAL_FLOOR,
+    ChainChanges,
     Step,
     StepPart,
     failed_step,
@@ -134,6 +135,10 @@ class BorderedNormalEquations:
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, landmarks and border known."""
         return self.inner.conditional_covariance(name)
+
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
+        """Variances of changes along chains by the last factors, landmarks and border known."""
+        return self.inner.variance_of_changes(changes)
 
     def _reduced(self, added: Float[Tensor, " z"]) -> Reduced:
         """The border's own system, by the last factors of the inner one."""

@@ -39,6 +39,7 @@ from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
 from crowdmap_torch.optim.solvers.layout import Layout, SparsityPattern, read_entries
 from crowdmap_torch.optim.solvers.normal_equations import (
     DIAGONAL_FLOOR,
+    ChainChanges,
     LinearFunctions,
     Step,
     StepPart,
@@ -220,6 +221,18 @@ class ChainNormalEquations:
         """Covariance of every block of an eliminated variable, the landmarks known."""
         found = diagonal_of_inverse(self.structure, self.diagonal, self.link)
         return self.structure.unstack(found)[name]
+
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
+        """Variances of the changes between blocks of chains, by the last factors: leaves marginalised, all else known."""
+        like, k = self.eliminated_gradient, self.eliminated_gradient.shape[1]
+        leaves, number = self.structure.plan.leaf_count, torch.arange(k, device=like.device)
+        at = (*changes.pair.add(leaves).T[..., None], changes.column[:, None] * k + number)
+        right_side = like.new_zeros(len(like), k, changes.columns * k)
+        first, second, column = at
+        right_side[first, number, column] = -1
+        right_side[second, number, column] = 1
+        found = self.solve_eliminated(right_side)
+        return found[second, number, column] - found[first, number, column]
 
     def factorise(
         self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"]

@@ -32,6 +32,7 @@ from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
 from crowdmap_torch.optim.solvers.layout import SparsityPattern
 from crowdmap_torch.optim.solvers.normal_equations import (
     DIAGONAL_FLOOR,
+    ChainChanges,
     LinearFunctions,
     Step,
     StepPart,
@@ -186,6 +187,10 @@ class ConjugateGradientEquations:
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, landmarks and border known."""
         return self.inner.conditional_covariance(name)
+
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
+        """Variances of changes along chains by the last factors, landmarks and border known."""
+        return self.inner.variance_of_changes(changes)
 
     def samples(
         self, count: int, generator: torch.Generator, *, floor: float

@@ -95,6 +95,21 @@ class LinearFunctions:
         return cls(slots, tuple(part.expand(rows, *part.shape) for part in parts))
 
 
+@dataclass(frozen=True)
+class ChainChanges:
+    """Changes along chains: differences between blocks of one chain."""
+
+    pair: Int[Tensor, "q 2"]
+    """The blocks, the first is subtracted."""
+    column: Int[Tensor, " q"]
+    """Those of one column are of different chains, and asked for at once."""
+
+    @property
+    def columns(self) -> int:
+        """How many columns there are."""
+        return int(self.column.max()) + 1 if len(self.column) else 0
+
+
 @runtime_checkable
 class Covariance(Protocol):
     """The inverse of the Hessian, as far as it is asked for."""
@@ -157,6 +172,10 @@ class MapEquations(NormalEquations, Protocol):
 
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, landmarks and border known."""
+        ...
+
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
+        """Variances of changes along chains by the factors of the last step, landmarks and border known."""
         ...
 
 

@@ -14,6 +14,7 @@ from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
+from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 
 
@@ -301,3 +302,21 @@ def test_the_order_is_kept_while_rows_go_no_further_than_there_is_room(by: int, 
     back = backend.assemble(built, values).solve(damping)
     first = ChainBackend(plan).assemble(built, values).solve(damping)
     assert all(torch.equal(back.delta[name], first.delta[name]) for name in values)
+
+
+def test_changes_along_chains_vary_as_the_dense_inverse_says():
+    built, values, chain = problem([12, 7])
+    normal = ChainBackend(EliminationPlan("pose", chain)).assemble(built, values)
+    tiny = torch.tensor([1e-12], dtype=torch.float64)
+    normal.solve(tiny)
+    changes = ChainChanges(torch.tensor([[0, 5], [12, 15], [5, 11]]), torch.tensor([0, 0, 1]))
+    found = normal.variance_of_changes(changes)
+    dense = DenseBackend().assemble(built, values)
+    H, where = dense.hessian[0], dense.where
+    at = where.offset["pose"][:, None] + torch.arange(3)
+    # The landmarks known: their rows and columns struck out.
+    P = torch.linalg.inv(H[at.flatten()[:, None], at.flatten()]).view(len(chain), 3, len(chain), 3)
+    for k, (a, b) in enumerate(changes.pair.tolist()):
+        for i in range(3):
+            expected = P[a, i, a, i] + P[b, i, b, i] - 2 * P[a, i, b, i]
+            assert float(found[k, i]) == pytest.approx(float(expected), rel=1e-6)
