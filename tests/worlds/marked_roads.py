@@ -73,7 +73,9 @@ def marked_map(
             **support(n),
         ),
         lanes=Lanes(
-            type=torch.tensor([-1 if t is None else LANE_TYPES.index(t) for t, _ in markers]),
+            type=torch.tensor(
+                [-1 if t is None else LANE_TYPES.index(t) for t, _ in markers]
+            ).long(),
             control_start=count.cumsum(0) - count,
             control_count=count,
             **support(m),
@@ -90,7 +92,7 @@ def marked_map(
 def two_way_road() -> HdMap:
     """120 m of road to the east: two lanes that way, one back; the middle line in two pieces, signs for both ways."""
     markers = [
-        ("curb", line((119, 7.0), (0, 7.0))),
+        ("curb", line((120, 7.0), (0, 7.0))),
         ("double", line((0, 3.5), (60, 3.5))),
         ("double", line((60, 3.5), (120, 3.5))),
         ("dashed", line((0, 0), (120, 0))),

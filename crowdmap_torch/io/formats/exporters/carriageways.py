@@ -30,8 +30,6 @@ _MIN_POINTS = 5
 """Fewer points in a row side by side are no lane."""
 _SAME_CUT = 4
 """Cuts on both sides of a lane that are so few points apart are one."""
-_LONGEST = 100
-"""Longer cells are cut into equal ones of so many points at most, for what is said of a lane to be near."""
 LEFT, RIGHT = 0, 1
 
 
@@ -103,11 +101,16 @@ class _Strip:
         return round(float(np.interp(vertex, x[order], y[order])))
 
 
-def carriageways(points_world: list[Float[np.ndarray, "_ 3"]]) -> Carriageways:
-    """Borders and lanes of pieces of markers, given by their points, 1 m apart at most."""
+def carriageways(
+    points_world: list[Float[np.ndarray, "_ 3"]], longest: int | None = None
+) -> Carriageways:
+    """Borders and lanes of pieces of markers, given by their points, 1 m apart at most.
+
+    Cells of more than `longest` points are cut into equal ones, for what is said of a lane to be near.
+    """
     found, stubs = chains(points_world)
     strips = _strips(found)
-    cuts = _cuts(found, strips)
+    cuts = _cuts(found, strips, longest)
     borders, border_at = _borders(found, cuts)
     return Carriageways(found, borders, _cells(found, strips, cuts, border_at), stubs)
 
@@ -194,7 +197,7 @@ def _runs(key: Int[np.ndarray, " n"]) -> list[Int[np.ndarray, " r"]]:
     return runs
 
 
-def _cuts(found: list[Chain], strips: list[_Strip]) -> list[set[int]]:
+def _cuts(found: list[Chain], strips: list[_Strip], longest: int | None) -> list[set[int]]:
     """Where every chain is cut: at its ends and joints, at ends of lanes, and across from cuts of neighbours."""
     cuts: list[set[int]] = [set() for _ in found]
     beside: list[list[tuple[_Strip, int]]] = [[] for _ in found]
@@ -230,9 +233,9 @@ def _cuts(found: list[Chain], strips: list[_Strip]) -> list[set[int]]:
                     cut(other, across)
 
     cut_neighbours()
-    for number in range(len(found)):
+    for number in range(len(found) if longest else 0):
         for first, last in pairwise(sorted(cuts[number])):
-            parts = -(-(last - first) // _LONGEST)
+            parts = -(-(last - first) // (longest or 1))
             for vertex in np.linspace(first, last, parts + 1).round().astype(int).tolist()[1:-1]:
                 if not any(abs(c - vertex) <= _SAME_CUT for c in cuts[number]):
                     cut(number, vertex)

@@ -26,6 +26,7 @@ class ExportFormat:
 FORMATS = {
     "geojson": ExportFormat("GeoJSON", ".geojson"),
     "lanelet2": ExportFormat("Lanelet2 (OSM)", ".osm"),
+    "opendrive": ExportFormat("ASAM OpenDRIVE 1.7", ".xodr"),
     "geopackage": ExportFormat("GeoPackage", ".gpkg", extra="gis"),
     "flatgeobuf": ExportFormat("FlatGeobuf", ".fgb", extra="gis", is_folder=True),
     "kml": ExportFormat("KML", ".kml"),

@@ -24,6 +24,8 @@ from crowdmap_torch.io.formats.exporters.sign_lanes import lanes_of_signs
 from crowdmap_torch.io.formats.geodesy import geodetic_from_local
 from crowdmap_torch.tables import HdMap
 
+LONGEST = 100
+"""Points of a lanelet, 1 m apart at most."""
 LINE_TAGS = {
     "solid": {"type": "line_thin", "subtype": "solid"},
     "dashed": {"type": "line_thin", "subtype": "dashed"},
@@ -45,7 +47,7 @@ class _Member:
 def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     """Writes an OSM file; returns what it has no place for, a line each."""
     points = lane_points(hd_map.lanes)
-    ways = carriageways(points)
+    ways = carriageways(points, LONGEST)
     lines = [
         "<?xml version='1.0' encoding='UTF-8'?>",
         f'<osm version="0.6" generator="crowdmap_torch {__version__}">',

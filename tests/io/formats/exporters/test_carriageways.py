@@ -114,7 +114,7 @@ def test_a_lane_that_joins_cuts_those_beside_it():
 
 
 def test_long_lanes_are_cut():
-    ways = carriageways([line((0, 0), (500, 0)), line((0, 3.5), (500, 3.5))])
+    ways = carriageways([line((0, 0), (500, 0)), line((0, 3.5), (500, 3.5))], longest=100)
     lengths = [len(ways.nodes(c.left)) - 1 for c in ways.cells]
     assert sum(lengths) == 500 and max(lengths) <= 100
 

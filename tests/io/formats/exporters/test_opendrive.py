@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from worlds.marked_roads import bend, line, marked_map, two_way_road
+from worlds.opendrive_reader import ReadRoad, facing, number
+
+from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.formats.exporters.features import lane_points
+from crowdmap_torch.io.formats.exporters.opendrive import write
+from crowdmap_torch.tables import HdMap
+
+
+def hill() -> HdMap:
+    """A bend of 40 m, banked, on which one lane runs on where the other two end, with a sign; and a line by itself."""
+    markers = [
+        ("solid", bend(40, 170, 0.0)),
+        ("dashed", bend(40, 170, -3.4)),
+        ("solid", bend(40, 90, -6.9)),
+        (None, line((200, 0), (230, 0))),
+    ]
+    signs = [("DE:205", (50.0, 30.0, 5.0, 250.0)), ("US:R1-1", (5.0, -12.0, 3.0, 200.0))]
+    return marked_map(markers, signs)
+
+
+WORLDS = {"two-way": two_way_road, "hill": hill}
+
+
+def exported(hd_map: HdMap, folder: Path) -> list[ReadRoad]:
+    write(hd_map, folder / "map.xodr")
+    root = ET.parse(folder / "map.xodr").getroot()
+    assert root.find("header").attrib["revMinor"] == "7"  # pyright: ignore[reportOptionalMemberAccess]
+    return [ReadRoad(road) for road in root.iter("road")]
+
+
+def dense(points: np.ndarray) -> np.ndarray:
+    share = np.linspace(0, 1, 21)[:-1, None, None]
+    return (points[:-1] + share * np.diff(points, axis=0)).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_borders_of_lanes_are_the_markers(world: str, tmp_path: Path):
+    hd_map = WORLDS[world]()
+    markers = KDTree(np.concatenate([dense(p) for p in lane_points(hd_map.lanes)]))
+    reads = exported(hd_map, tmp_path)
+    found = []
+    for road in reads:
+        for s in np.linspace(0, road.length, 60):
+            found += [road.world(s, t) for t in road.borders(s).values()]
+    # Chords of points a metre apart cut a bend of 40 m by 3 mm; what lies between them is 2.5 cm from a sample at most.
+    assert markers.query(found)[0].max() < 0.05
+    # And they reach along all of them but the one by itself.
+    border = KDTree(np.array(found))
+    for points in lane_points(hd_map.lanes)[:-1]:
+        assert np.mean(border.query(points)[0] < 2.0) > 0.97
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_signals_stand_and_face_as_the_signs(world: str, tmp_path: Path):
+    hd_map = WORLDS[world]()
+    signs = hd_map.signs
+    told = {}
+    for road in exported(hd_map, tmp_path):
+        for signal in road.element.iter("signal"):
+            told[signal.attrib["name"]] = (signal, road)
+    assert told.keys() == {*hd_map.sign_id}
+    for row, name in enumerate(hd_map.sign_id):
+        signal, road = told[name]
+        corners = polygon.corners(signs.shape[row], signs.size[row])
+        T = signs.T_world_sign[row].numpy()
+        bottom = T[:3, 3] + float(corners[:, 1].min()) * T[:3, 1]
+        place = road.world(*(number(signal, key) for key in ("s", "t", "zOffset")))
+        np.testing.assert_allclose(place, bottom, rtol=0, atol=1e-3)
+        np.testing.assert_allclose(facing(signal, road), T[:3, 2], rtol=0, atol=1e-6)
+        inertial = signal.find("positionInertial")
+        assert inertial is not None
+        np.testing.assert_allclose([number(inertial, a) for a in "xyz"], bottom, atol=1e-9)
+        assert [number(signal, "width"), number(signal, "height")] == signs.size[row].tolist()
+        code = None if signs.type[row] < 0 else hd_map.type_names[signs.type[row]]
+        country, _, rest = (code or ":-1").partition(":")
+        assert signal.attrib["type"] == rest and signal.attrib.get("country", "") == country
+        kept = json.loads(signal.find("userData").attrib["value"])  # pyright: ignore[reportOptionalMemberAccess]
+        assert kept["sign_id"] == name and kept["n_observations"] == 20 + row
+
+
+def test_lanes_of_both_directions_lie_on_either_side_of_lane_0(tmp_path: Path):
+    reads = exported(two_way_road(), tmp_path)
+    for road in reads:
+        assert road.element.attrib["rule"] == "RHT"
+        marks = {k: lane.find("roadMark").attrib["type"] for k, lane in road.lanes().items()}  # pyright: ignore[reportOptionalMemberAccess]
+        # The line may run either way.
+        east = -1 if min(marks) == -2 else 1
+        assert marks == {-east: "curb", 0: "solid solid", east: "broken", 2 * east: "solid"}
+        heading = road.line(0.0)[2]
+        assert np.cos(heading) == pytest.approx(-east)
+
+
+def test_roads_go_on_into_one_another(tmp_path: Path):
+    for world in WORLDS.values():
+        reads = exported(world(), tmp_path)
+        assert len(reads) == 2
+        joined = 0
+        for road in reads:
+            follower = road.element.find("link/successor")
+            if follower is None:
+                continue
+            (other,) = (r for r in reads if r.element.attrib["id"] == follower.attrib["elementId"])
+            assert follower.attrib["contactPoint"] == "start"
+            ends, starts = road.borders(road.length), other.borders(0.0)
+            for number_, lane in road.lanes().items():
+                link = lane.find("link/successor")
+                if link is not None:
+                    joined += 1
+                    mine = road.world(road.length, ends[number_])
+                    its = other.world(0.0, starts[int(link.attrib["id"])])
+                    # Each road tilts as fits its own markers.
+                    np.testing.assert_allclose(mine[:2], its[:2], rtol=0, atol=1e-3)
+        assert joined >= 1
+
+
+def test_what_is_left_out_is_said(tmp_path: Path):
+    losses = write(hill(), tmp_path / "hill.xodr")
+    assert losses[0].startswith("30 m of markers without a lane")
+    far = marked_map([("solid", line((0, 0), (50, 0)))], [("US:R1-1", (10.0, 3.0, 2.0, 180.0))])
+    assert any(loss.startswith("1 signs: there is no road") for loss in write(far, tmp_path / "x"))
+    beside = marked_map(
+        [("solid", line((0, 0), (50, 0))), ("solid", line((0, -3), (50, -3)))],
+        [("US:R1-1", (90.0, -5.0, 2.0, 180.0))],
+    )
+    assert any("positionInertial" in loss for loss in write(beside, tmp_path / "y"))
+
+
+def test_a_map_without_landmarks_is_written(tmp_path: Path):
+    assert write(marked_map([]), tmp_path / "bare.xodr") == ()
+    assert [e.tag for e in ET.parse(tmp_path / "bare.xodr").getroot()] == ["header"]
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_checker_of_asam_finds_nothing(world: str, tmp_path: Path):
+    checker = shutil.which("qc_opendrive")
+    if checker is None:
+        pytest.skip("qc_opendrive (asam-qc-opendrive, in an environment of its own) is not on PATH")
+    write(WORLDS[world](), tmp_path / "map.xodr")
+    (tmp_path / "config.xml").write_text(
+        f'<Config><Param name="InputFile" value="{tmp_path / "map.xodr"}"/>'
+        '<CheckerBundle application="xodrBundle">'
+        f'<Param name="resultFile" value="{tmp_path / "result.xml"}"/></CheckerBundle></Config>'
+    )
+    subprocess.run([checker, "-c", str(tmp_path / "config.xml")], check=True, capture_output=True)
+    result = ET.parse(tmp_path / "result.xml").getroot()
+    assert len([*result.iter("Checker")]) > 15
+    assert [issue.attrib["description"] for issue in result.iter("Issue")] == []
+    assert not [c for c in result.iter("Checker") if c.attrib["status"] == "error"]
