@@ -62,7 +62,8 @@ def write_drive(journey_folder: Path, out: Path) -> None:
         "categories": [{"id": k, "name": CLASSES[s]} for k, s in enumerate(polygon.SHAPES)],
         "annotations": [],
     }
-    signs = journey.signs
+    # In the order of the rows, by which the survey's truth knows them.
+    signs = journey.signs[journey.signs.row.argsort()]
     rows = zip(
         signs.frame.tolist(),
         signs.shape.tolist(),
@@ -87,7 +88,8 @@ def write_drive(journey_folder: Path, out: Path) -> None:
 
     v_of_rows = np.arange(0, size["height"], ROWS_PX)
     lanes: list[list[list[float]]] = [[] for _ in names]
-    for number, frame in enumerate(journey.lanes.frame.tolist()):
+    for number in journey.lanes.row.argsort().tolist():
+        frame = int(journey.lanes.frame[number])
         u, v = journey.lane_points.px[journey.lane_points.detection == number].numpy().T
         order = np.argsort(v)
         inside = (v_of_rows >= v.min()) & (v_of_rows <= v.max())

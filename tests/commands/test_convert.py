@@ -40,6 +40,7 @@ def test_the_tutorials_commands_lead_to_a_map(
         assert len(one.lanes) == len(other.lanes)
     figures = capsys.readouterr().out.rpartition("Signs")[2]
     assert re.search(r"recall +100\.0 %\n +precision +100\.0 %", figures)
+    assert re.search(r"pair precision +100\.0 %", figures)
 
 
 def test_the_tutorial_lists_every_format():

@@ -67,6 +67,7 @@ def compose(
 ) -> Drive:
     """One journey from the parts of all sources; InputError if a part is missing, there twice, or contradicts another."""
     track = _only("poses", [(p.track, p.track.source) for p in parts if p.track is not None])
+    _refuse_unsaid(parts, asked, track)
     rigs = [(described_rig(p.rig, asked), Path(p.rig.rig_id)) for p in parts if p.rig is not None]
     if rig is not None:
         rigs.append((read_given_rig(rig), rig))
@@ -264,6 +265,27 @@ def _only(what: str, found: Sequence[tuple[T, object]]) -> T:
     if len(found) > 1:
         raise InputError(f"{found[0][1]} and {found[1][1]} both give the {what}; expected one")
     return found[0][0]
+
+
+def _refuse_unsaid(parts: Sequence[Parts], asked: Asked, track: Track) -> None:
+    """InputError that names all options at once, if several are missing."""
+    has_images = any(p.signs is not None or p.lanes is not None for p in parts)
+    is_placed = asked.origin is not None or any(p.origin is not None for p in parts)
+    missing = [
+        text
+        for is_missing, text in (
+            (track.world is None and asked.world is None, "--world (the axes of their world)"),
+            (track.link is None and asked.link is None, "--axes (the axes of what moves)"),
+            (has_images and asked.images is None, "--images (which frame an image is)"),
+            (not is_placed, "--origin LAT LON HEIGHT (where their world is on the earth)"),
+        )
+        if is_missing
+    ]
+    if len(missing) > 1:
+        raise InputError(
+            f"{track.source}: some things about poses are not in the files, and nothing is guessed; give "
+            f"{', '.join(missing)}: see crowdmap convert --help"
+        )
 
 
 def _origin(parts: Sequence[Parts], asked: Asked, track: Track) -> Origin:

@@ -116,6 +116,12 @@ def test_what_nobody_said_is_asked_for(tmp_path: Path, changed: dict, expected: 
         compose(parts_of(tmp_path, asked), asked, rig=foreign.write_rig(tmp_path / "car"))
 
 
+def test_all_that_nobody_said_is_asked_for_at_once(tmp_path: Path):
+    expected = r"drive\.txt: .* give --world .*, --axes .*, --images .*, --origin LAT LON HEIGHT"
+    with pytest.raises(InputError, match=expected):
+        compose(parts_of(tmp_path), Asked(), rig=foreign.write_rig(tmp_path / "car"))
+
+
 def test_what_contradicts_is_refused(tmp_path: Path):
     rig = foreign.write_rig(tmp_path / "car")
     poses, signs, lanes = parts_of(tmp_path)
