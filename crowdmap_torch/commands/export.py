@@ -1,7 +1,7 @@
 """Writes a map in a format of others: `crowdmap export MAP --to FORMAT [-o FILE] [--overwrite]`.
 
-MAP is a map, a survey whose signs have corners, or a RUN, whose map is taken. What the format has no place for is said in a
-line each.
+MAP is a map, a survey whose signs have corners, or a RUN, whose map is taken; `tum` and `kitti` write the refined poses of a
+RUN, into a folder. What the format has no place for is said in a line each.
 """
 
 from __future__ import annotations
@@ -12,15 +12,23 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from crowdmap_torch.io.errors import InputError, input_read
-from crowdmap_torch.io.formats.exporters.export import FORMATS, ExportFormat, export_map
+from crowdmap_torch.io.formats.exporters.export import (
+    FORMATS,
+    TRAJECTORIES,
+    ExportFormat,
+    export_map,
+    export_run,
+)
 from crowdmap_torch.io.maps import read_map
+
+_ALL = FORMATS | TRAJECTORIES
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap export` takes."""
     parser.add_argument("map", type=Path, metavar="MAP", help="a map, a survey, or a RUN")
-    titles = "; ".join(f"{name}: {form.title}" for name, form in FORMATS.items())
-    parser.add_argument("--to", required=True, choices=[*FORMATS], metavar="FORMAT", help=titles)
+    titles = "; ".join(f"{name}: {form.title}" for name, form in _ALL.items())
+    parser.add_argument("--to", required=True, choices=[*_ALL], metavar="FORMAT", help=titles)
     parser.add_argument(
         "-o", "--out", type=Path, metavar="FILE", help="default: beside MAP, named after it"
     )
@@ -29,7 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Writes the file, and prints what went into it and what did not."""
-    form = FORMATS[options.to]
+    form = _ALL[options.to]
+    if options.to in TRAJECTORIES:
+        _run_trajectories(options, form)
+        return
     folder = _map_folder(options.map)
     out = options.out or folder.resolve().with_name(f"{folder.resolve().name}{form.ending}")
     _require_free(out, folder, form, options.overwrite)
@@ -41,6 +52,17 @@ def run(options: argparse.Namespace) -> None:
     print(f"{form.title}: {out}: {len(hd_map.signs)} signs, {len(hd_map.lanes)} lane pieces")
     if left:
         losses = (f"{left} tentative signs, which are not part of the map", *losses)
+    for loss in losses:
+        print(f"left out: {loss}")
+
+
+def _run_trajectories(options: argparse.Namespace, form: ExportFormat) -> None:
+    run = options.map.resolve()
+    out = options.out or run.with_name(f"{run.name}{form.ending}")
+    _require_free(out, run, form, options.overwrite)
+    with input_read():
+        losses = export_run(run, out, options.to)
+    print(f"{form.title}: {out}: {len([*out.iterdir()])} journeys")
     for loss in losses:
         print(f"left out: {loss}")
 

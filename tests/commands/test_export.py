@@ -86,3 +86,14 @@ def test_a_place_that_cannot_be_written_is_one_line(survey: Path, tmp_path: Path
     out = tmp_path / "file" / "street.geojson"
     assert main(["export", str(survey), "--to", "geojson", "-o", str(out)]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_trajectories_of_a_run_are_files_of_a_folder(survey: Path, tmp_path: Path, capsys):
+    shutil.copytree(survey.parent / "journeys", tmp_path / "run" / "journeys")
+    assert main(["export", str(tmp_path / "run"), "--to", "tum"]) == 0
+    (file,) = (tmp_path / "run.tum").iterdir()
+    assert file.name == "journey-000.tum"
+    assert "1 journeys" in capsys.readouterr().out
+    assert "--overwrite" in failure(capsys, tmp_path / "run", "--to", "tum")
+    assert "expected a RUN" in failure(capsys, survey, "--to", "kitti", "-o", tmp_path / "k")
+    assert not (tmp_path / "k").exists()

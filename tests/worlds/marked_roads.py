@@ -31,7 +31,7 @@ def bend(radius: float, degrees: float, aside: float) -> np.ndarray:
 
 
 def marked_map(
-    markers: list[tuple[str | None, np.ndarray]], signs: Sequence[tuple[str | None, tuple]] = ()
+    markers: Sequence[tuple[str | None, np.ndarray]], signs: Sequence[tuple[str | None, tuple]] = ()
 ) -> HdMap:
     """A map of markers, given by type and points, and of signs, given by code and (x, y, z, direction faced [deg])."""
     points = [np.asarray(p, dtype=np.float64) for _, p in markers]

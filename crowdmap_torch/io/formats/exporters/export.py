@@ -8,6 +8,7 @@ from pathlib import Path
 
 from crowdmap_torch.io.atomic import atomic_file, atomic_folder
 from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.formats.exporters.trajectories import write_kitti, write_tum
 from crowdmap_torch.tables import HdMap
 
 
@@ -30,6 +31,7 @@ FORMATS = {
     "geopackage": ExportFormat("GeoPackage", ".gpkg", extra="gis"),
     "flatgeobuf": ExportFormat("FlatGeobuf", ".fgb", extra="gis", is_folder=True),
     "kml": ExportFormat("KML", ".kml"),
+    "compact": ExportFormat("compact map", ".cmap"),
 }
 """By the name of the module in this folder, whose `write(hd_map, path)` returns what it had to leave out, a line each."""
 
@@ -51,3 +53,21 @@ def export_map(hd_map: HdMap, path: Path, to: str) -> tuple[str, ...]:
         ) from missing
     with atomic_folder(path) if FORMATS[to].is_folder else atomic_file(path) as beside:
         return module.write(hd_map, beside)
+
+
+TRAJECTORIES = {
+    "tum": ExportFormat("TUM trajectories", ".tum", is_folder=True),
+    "kitti": ExportFormat("KITTI trajectories", ".kitti", is_folder=True),
+}
+"""Of the refined poses of a run, a file for each journey."""
+
+
+def export_run(run: Path, path: Path, to: str) -> tuple[str, ...]:
+    """Writes the trajectories of a run into a folder, and returns what the format has no place for, a line each.
+
+    InputError for a format that nobody knows, or a folder that is no run's.
+    """
+    if to not in TRAJECTORIES:
+        raise InputError(f"format {to!r} is unknown; expected one of {', '.join(TRAJECTORIES)}")
+    with atomic_folder(path) as folder:
+        return {"tum": write_tum, "kitti": write_kitti}[to](run, folder)
