@@ -16,6 +16,10 @@ from crowdmap_torch.io.formats.geodesy import (
 )
 from crowdmap_torch.tables import Origin
 
+_WEEK_S = 604_800.0
+_UTC_TO_GPS_S = 18.0 - 315_964_800.0
+"""GPS counts from 1980 on, and is ahead of UTC by 18 s since 2017, before comma2k19 was recorded."""
+
 
 @dataclass(frozen=True)
 class RecordedErrors:
@@ -39,19 +43,26 @@ class RecordedErrors:
 
 
 def read_recorded_errors(folder: Path) -> RecordedErrors:
-    """Of a segment of comma2k19: fixes of `GNSS/live_gnss_ublox` less `global_pose`, wherever both are."""
+    """Of a segment of comma2k19: fixes of `GNSS/live_gnss_ublox` less `global_pose` at the same GPS times, where both are.
+
+    When fixes arrived stands there too: that trembles by hundredths of a second, which is a quarter of a metre of the way.
+    """
     position = _array(folder / "global_pose" / "frame_positions", 3)
-    t_position = _array(folder / "global_pose" / "frame_times")
+    clock = _array(folder / "global_pose" / "frame_gps_times", 2)
+    # Latitude, longitude, speed, UTC [ms], height, course.
     fix = _array(folder / "GNSS" / "live_gnss_ublox" / "value", 6)
-    t_fix = _array(folder / "GNSS" / "live_gnss_ublox" / "t")
-    if len(position) != len(t_position) or len(fix) != len(t_fix):
-        raise InputError(f"{folder}: expected as many times as positions, and as fixes")
+    if len(position) != len(clock):
+        raise InputError(f"{folder}: expected as many times as positions")
+    t_fix = fix[:, 3] * 1e-3 + _UTC_TO_GPS_S
+    t_position = clock @ [_WEEK_S, 1.0]
+    for t, what in ((t_position, "positions"), (t_fix, "fixes")):
+        if (np.diff(t) <= 0).any():
+            raise InputError(f"{folder}: expected {what} one after the other")
     both = (t_fix >= t_position[0]) & (t_fix <= t_position[-1])
     if both.sum() < 2:
         raise InputError(f"{folder}: expected fixes at the times of the positions, found none")
     origin = Origin(*geodetic_from_ecef(position[0]).tolist())
     true = local_from_ecef(position, origin)
-    # Latitude, longitude, speed, time, height, course.
     measured = local_from_geodetic(fix[both][:, [0, 1, 4]], origin)
     t = t_fix[both]
     at_fix = np.stack([np.interp(t, t_position, axis) for axis in true.T], axis=-1)

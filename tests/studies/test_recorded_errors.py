@@ -27,13 +27,14 @@ def write(folder: Path) -> Path:
     way = np.stack((20 * t, 0.5 * t**2, 0 * t), axis=-1)
     at_fix = np.stack((20 * T_FIX, 0.5 * T_FIX**2, 0 * T_FIX), axis=-1)
     place = geodetic_from_local(at_fix + error_at(T_FIX), ORIGIN)
+    # Week 2000 began on 2018-05-06, 18 leap seconds ahead of UTC.
+    utc_ms = (1_525_564_782 + 100 + T_FIX) * 1e3
     nothing = np.zeros(len(T_FIX))
-    fix = np.stack((*place[:, :2].T, nothing, nothing, place[:, 2], nothing), axis=-1)
+    fix = np.stack((*place[:, :2].T, nothing, utc_ms, place[:, 2], nothing), axis=-1)
     arrays = {
         "global_pose/frame_positions": ecef_from_local(way, ORIGIN),
-        "global_pose/frame_times": 100 + t,
+        "global_pose/frame_gps_times": np.stack((np.full(len(t), 2000.0), 100 + t), axis=-1),
         "GNSS/live_gnss_ublox/value": fix,
-        "GNSS/live_gnss_ublox/t": 100 + T_FIX,
     }
     for name, array in arrays.items():
         path = folder / name
@@ -67,8 +68,13 @@ def test_a_long_drive_runs_through_the_record_and_back():
     ("name", "array", "message"),
     [
         ("GNSS/live_gnss_ublox/value", np.zeros((3, 5)), "expected finite numbers, 6 a row"),
-        ("global_pose/frame_times", np.zeros(3), "as many times as positions"),
-        ("GNSS/live_gnss_ublox/t", np.full(len(T_FIX), 5.0), "expected fixes at the times"),
+        ("global_pose/frame_gps_times", np.ones((3, 2)), "as many times as positions"),
+        ("global_pose/frame_gps_times", np.ones((200, 2)), "positions one after the other"),
+        (
+            "GNSS/live_gnss_ublox/value",
+            np.arange(12.0).reshape(2, 6),
+            "expected fixes at the times",
+        ),
     ],
 )
 def test_a_segment_that_is_none_is_one_line(
