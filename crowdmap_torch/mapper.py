@@ -123,6 +123,8 @@ class MapResult:
     """Of the signs and lanes of the map, tentative signs left out, and of the journeys' errors."""
     prior_scale: Float[Tensor, "j 3"]
     """By journey, how far the sigmas of its bias, drift and rotation were from those given."""
+    white_scale: Float[Tensor, "j 2"]
+    """The same of the noise from frame to frame, of positions and of rotations."""
     state: LmState
     control_points: int = 0
     """Surveyed signs that pin the map."""
@@ -353,6 +355,7 @@ def finish_map(
         poses=poses,
         uncertainty=uncertainty,
         prior_scale=bundle.prior_scale.clone(),
+        white_scale=bundle.white_scale.clone(),
         state=state,
         control_points=known,
     )

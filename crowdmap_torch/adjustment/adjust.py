@@ -35,6 +35,7 @@ from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.calibration import KnownCalibration
+from crowdmap_torch.noise.pose_evidence import pose_evidence
 from crowdmap_torch.noise.pose_prior import DriftNodes, drift_nodes, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
@@ -234,12 +235,9 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     state = lm.step(problem, state, bundle.config.lm, backend=backend)
     if not bool(state.accepted.all()):
         return state, state.done
-    changes = bundle.prior.sampled_changes()
-    if len(changes.pair):
-        variance = normal.variance_of_changes(changes)
-        bundle.drift_told.copy_(bundle.prior.told(changes, variance, bundle.prior_scale))
+    evidence = pose_evidence(bundle.prior, normal, bundle.prior_scale)
     bundle.fold(dict(state.values))
-    at_rest = bundle.refresh()
+    at_rest = bundle.refresh(evidence)
     if at_rest and (state.done or int(bundle.judged) == 0):
         at_rest = not bundle.judge(backend)
     if state.done and at_rest:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from crowdmap_torch.adjustment.calibration import ByOptics
 from crowdmap_torch.adjustment.config import AdjustConfig
+from crowdmap_torch.adjustment.landmark_terms import size_class_term, slide_term
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
 from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
 from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
@@ -23,6 +24,7 @@ from crowdmap_torch.adjustment.shared_corner_errors import (
     shared_errors,
 )
 from crowdmap_torch.geometry import se3, spline_basis
+from crowdmap_torch.noise.pose_evidence import PoseEvidence, white_scales
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
 from crowdmap_torch.optim.problem import (
@@ -40,7 +42,7 @@ from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBac
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
-from crowdmap_torch.residuals import lane, reprojection, sign_prior
+from crowdmap_torch.residuals import lane, reprojection
 from crowdmap_torch.tables import to_device
 
 _PIXEL_DIM = 2
@@ -53,6 +55,8 @@ _NARROWS = 0.97
 """A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
 _SCALE_RESTS = 0.005
 """A scale of the prior that would change by less than this share is at rest."""
+_WHITE_RESTS = 0.03
+"""A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
 _LASTING_RESTS = 0.1
 """The variance of a detection's shift that would change by less than this share is at rest."""
 
@@ -94,6 +98,8 @@ class Bundle(nn.Module):
     """Detections, by number, that have no say."""
     prior_scale: Tensor
     """By journey, how far bias, drift and rotation are from the sigmas of `prior`."""
+    white_scale: Tensor
+    """By journey, how far the noise of positions and of rotations from frame to frame is from that of `prior`."""
     drift_told: Tensor
     """By journey and number of a pose, the share of the drift's changes that observations tell."""
 
@@ -121,6 +127,7 @@ class Bundle(nn.Module):
         self.register_buffer("given_up", given_up)
         self.register_buffer("judged", torch.zeros_like(given_up, dtype=torch.long).sum())
         self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
+        self.register_buffer("white_scale", torch.ones_like(values["bias"][:, :2]))
         self.register_buffer("drift_told", torch.ones_like(values["bias"]))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points
@@ -205,12 +212,13 @@ class Bundle(nn.Module):
         return BorderedBackend(self._plan)
 
     @torch.no_grad()
-    def refresh(self) -> bool:
+    def refresh(self, evidence: PoseEvidence | None = None) -> bool:
         """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
 
         The scales of pixels start at what the residuals show, so that a wrong start does not make outliers of
         everything, and fall as the fit improves; they never grow again. What detections of a sign have wrong together is
-        told from zero on once they are at rest: before that it is the drift. Those of the poses' prior follow the drift.
+        told from zero on once they are at rest: before that it is the drift. Those of the poses' prior follow the drift and
+        the noise about it, as far as there is `evidence` of them.
         """
         values = self.values()
         if len(self.lane_points):
@@ -220,12 +228,26 @@ class Bundle(nn.Module):
             self.match_valid = found.valid
         self.relinearise()
         at_rest = self._narrow(values)
+        if evidence is not None:
+            self.drift_told.copy_(evidence.told)
+            at_rest &= self._rescale_noise(values, evidence)
         rescaled = self.prior.rescaled(values["drift"], self.prior_scale, self.drift_told)
         moved = (rescaled / self.prior_scale).log().abs() > _SCALE_RESTS
         # Within that they stay as they are, to the last digit: the cost is to fall from step to step.
         self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))
         self.refreshed.fill_(True)
         return at_rest and not bool(moved.any())
+
+    def _rescale_noise(self, values: dict[str, Tensor], evidence: PoseEvidence) -> bool:
+        """Finds the noise of poses from frame to frame; returns whether it has come to rest."""
+        terms = self.prior.terms(self.prior_scale, self.white_scale)
+        residual = whitened_residuals(self.fleet.of_poses(terms["pose_white"]), values)
+        found = white_scales(
+            self.prior, residual, evidence.left, self.prior_scale, self.white_scale
+        )
+        moved = (found / self.white_scale).log().abs() > _WHITE_RESTS
+        self.white_scale.copy_(torch.where(moved, found, self.white_scale))
+        return not bool(moved.any())
 
     @torch.no_grad()
     def relinearise(self) -> None:
@@ -327,9 +349,13 @@ class Bundle(nn.Module):
     def _terms(self, prior_scale: Float[Tensor, "j 3"]) -> dict[str, CostTerm]:
         if not bool(self.refreshed):
             self.refresh()
-        terms = {**self.prior.terms(prior_scale), **self.fleet.priors(), **self.fixed}
+        terms = {
+            **self.prior.terms(prior_scale, self.white_scale),
+            **self.fleet.priors(),
+            **self.fixed,
+        }
         terms["pose_white"] = self.fleet.of_poses(terms["pose_white"])
-        terms.update(self._size_term())
+        terms.update(size_class_term(self.values()["size"], self.config))
         terms.update(self._corner_term(self.corner_sigma()))
         terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))
         return terms
@@ -374,41 +400,11 @@ class Bundle(nn.Module):
         loss = JointTukey.by_efficiency(detection, bound, row_dim=_PIXEL_DIM)
         return loss.without(self.given_up[detection])
 
-    def _size_term(self) -> dict[str, CostTerm]:
-        size = self.values()["size"].detach()
-        classes = size.new_tensor(self.config.size_classes_m)
-        if not len(classes) or not len(size):
-            return {}
-        away = (size[:, None] / classes).log().square().sum(-1)
-        term = CostTerm(
-            sign_prior.size_class,
-            (("size", torch.arange(len(size), device=size.device)),),
-            (classes[away.argmin(1)],),
-            size.new_full((len(size),), 1 / self.config.size_class_sigma),
-            Tukey(self.config.tukey_c),
-            takes_rows=True,
-        )
-        return {"size_class": term}
-
     def _slide_term(self) -> dict[str, CostTerm]:
-        """Keeps lanes from sliding along themselves within a step: nothing in the images says where they are.
-
-        The hold is at the place of the moment, so it does not pull; the map's covariance is taken without it.
-        """
         if not len(self.lane_points):
             return {}
-        values = self.values()
-        index = torch.arange(len(self.beside), device=self.beside.device)
-        offset = (values["lane"] - values["pose"][self.beside, :3, 3]).detach()
-        along = self.fixed["lane_prior"].constants[1][:, :, 0]
-        term = CostTerm(
-            lane.lane_slide,
-            (("pose", self.beside), ("lane", index)),
-            (offset, along),
-            offset.new_full((len(offset),), 1 / self.config.lane_slide_m),
-            takes_rows=True,
-        )
-        return {"lane_slide": term}
+        values, along = self.values(), self.fixed["lane_prior"].constants[1][:, :, 0]
+        return slide_term(values["pose"], values["lane"], self.beside, along, self.config)
 
     def _lane_terms(self, sigma: float) -> dict[str, CostTerm]:
         rows = self.lane_points

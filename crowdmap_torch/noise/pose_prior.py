@@ -18,7 +18,6 @@ from torch import Tensor
 
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.problem import CostTerm
-from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
 from crowdmap_torch.tables import Journey
@@ -96,13 +95,14 @@ class PosePrior:
     slots: dict[str, tuple[tuple[str, Tensor], ...]]
     """What each term touches."""
 
-    def terms(self, scale: Float[Tensor, "j 3"]) -> dict[str, CostTerm]:
+    def terms(
+        self, scale: Float[Tensor, "j 3"], white_scale: Float[Tensor, "j 2"]
+    ) -> dict[str, CostTerm]:
         """Absolute and relative regularisation of the poses, the sigmas scaled."""
         nodes = self.nodes
         bias, drift = self._scaled(scale)
-        # Within a stretch the drift does move: by a random walk of a quarter of its length in the mean.
-        rate = 2 * drift.square() / self.length_m
-        white = (self.white_sigma.square() + rate * self.spacing_m / 4).sqrt()
+        noise = self.white_sigma * white_scale.repeat_interleave(3, dim=1)
+        white = (noise.square() + self.within_stretch(scale)).sqrt()
         journey, follows = nodes.journey, self.follows
         gap = (nodes.way[follows + 1] - nodes.way[follows]).clamp_min(0.1)[:, None]
         reach = self.length_m[journey[follows]]
@@ -137,29 +137,13 @@ class PosePrior:
             ),
         }
 
-    def sampled_changes(self) -> ChainChanges:
-        """Some of the changes that scales are told by, spread over each journey: as many as are solved for at once."""
-        journey = self.nodes.journey[self.far[:, 0]]
-        _, of, count = torch.unique_consecutive(journey, return_inverse=True, return_counts=True)
-        rank = torch.arange(len(of), device=of.device) - (count.cumsum(0) - count)[of]
-        column = torch.where(count[of] > _SAMPLED, rank * _SAMPLED // count[of], rank)
-        starts = torch.ones_like(column, dtype=torch.bool)
-        starts[1:] = (column[1:] != column[:-1]) | (of[1:] != of[:-1])
-        return ChainChanges(self.far[starts], column[starts])
+    def within_stretch(self, scale: Float[Tensor, "j 3"]) -> Float[Tensor, "j 6"]:
+        """Variance of the drift within a stretch in which it is taken to stand still.
 
-    def told(
-        self, changes: ChainChanges, variance: Float[Tensor, "q 6"], scale: Float[Tensor, "j 3"]
-    ) -> Float[Tensor, "j 6"]:
-        """By journey and number of a pose, the share of changes that observations tell, not the prior at this `scale`.
-
-        `variance` is what is left of each change when all is observed: of a change that nothing tells of, the prior's own
-        (MacKay, Bayesian Interpolation, 1992: the effective number of well determined parameters).
+        It does move: by a random walk of a quarter of the stretch's length in the mean.
         """
-        journey = self.nodes.journey[changes.pair[:, 0]]
-        of_each = scale[:, 1:].repeat_interleave(3, dim=1)[journey].square()
-        share = 1 - variance / (of_each * self._expected(changes.pair))
-        total = share.new_zeros(len(scale), 6).index_add_(0, journey, share.clamp(0, 1))
-        return total / torch.bincount(journey, minlength=len(scale)).clamp_min(1)[:, None]
+        drift = self._scaled(scale)[1]
+        return 2 * drift.square() / self.length_m * self.spacing_m / 4
 
     def rescaled(
         self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"], told: Float[Tensor, "j 6"]
@@ -183,7 +167,7 @@ class PosePrior:
         found, wider = self._scales(drift, scale, told)
         return found * wider.sqrt()
 
-    def _expected(self, pair: Int[Tensor, "q 2"]) -> Float[Tensor, "q 6"]:
+    def expected_changes(self, pair: Int[Tensor, "q 2"]) -> Float[Tensor, "q 6"]:
         """Mean squares of the drift's changes between nodes, by the sigmas as given."""
         first, second = pair.unbind(1)
         own = self.nodes.journey[first]
@@ -196,7 +180,7 @@ class PosePrior:
         """The scales, and for each the mean of its square over the median."""
         journeys, own = len(scale), self.nodes.journey
         first, second = self.far.unbind(1)
-        change = (drift[second] - drift[first]).square() / self._expected(self.far)
+        change = (drift[second] - drift[first]).square() / self.expected_changes(self.far)
         changes = drift.new_zeros(journeys, 6).index_add_(0, own[first], change)
         pairs = torch.bincount(own[first], minlength=journeys).to(drift)[:, None] * told
         count = torch.bincount(own, minlength=journeys).to(drift)[:, None]
@@ -308,12 +292,11 @@ _LEAST_STRENGTH = 3.0
 """With fewer degrees of freedom a variance has no mean worth the name."""
 _STRENGTH_SPREAD = 1.0
 """1-sigma of the logarithm of the journeys' degrees of freedom about the usual ones."""
-_SAMPLED = 8
-"""Changes of a journey whose variances are asked for, at most."""
 _SWEEPS = 60
 """Alternations between scales and what all journeys share."""
-_SCALES_SQUARED = (0.01, 100.0)
-"""Least and largest square of a scale."""
+LEAST_SCALE, MOST_SCALE = 0.1, 10.0
+"""Sigmas are never taken for further from those that are given."""
+_SCALES_SQUARED = (LEAST_SCALE**2, MOST_SCALE**2)
 
 
 def pose_prior(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import torch
+
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.noise.pose_prior import LEAST_SCALE, MOST_SCALE
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.summaries import (
     counts_of,
@@ -57,12 +60,12 @@ def metrics_of(
                 "bias_covariance": covariance[:3, :3].flatten(),
                 "heading_deg": s.heading_deg,
                 "heading_sigma_deg": s.heading_sigma_deg,
-                "sigma_scale": dict(zip(("bias", "drift", "rotation"), scale, strict=True)),
+                "sigma_scale": _named_scales(scale),
             }
             for s, covariance, scale in zip(
                 summaries,
                 result.uncertainty.bias_covariance,
-                result.prior_scale.tolist(),
+                torch.cat((result.prior_scale, result.white_scale), dim=1).tolist(),
                 strict=True,
             )
         ],
@@ -70,6 +73,18 @@ def metrics_of(
         "survey": None if figures is None else figures.as_dict(),
         "survey_clusters": None if figures_before is None else figures_before.as_dict(),
     }
+
+
+def _named_scales(scale: Sequence[float]) -> dict[str, object]:
+    """What the sigmas of a journey's errors were multiplied by, by name; and which of these could not go further."""
+    named = dict(zip(("bias", "drift", "rotation", "noise", "rotation_noise"), scale, strict=True))
+    bounds = [LEAST_SCALE, LEAST_SCALE, LEAST_SCALE, 0.0, 0.0]
+    at_bound = [
+        name
+        for (name, found), least in zip(named.items(), bounds, strict=True)
+        if found <= least * (1 + 1e-6) or found >= MOST_SCALE * (1 - 1e-6)
+    ]
+    return {**named, "at_bound": at_bound}
 
 
 def _corner_covariances(result: MapResult) -> list[dict[str, object]]:

@@ -194,7 +194,9 @@ def test_metrics_tell_how_sure_corners_and_biases_are(run: Path):
         assert (covariance.diagonal().sqrt() > 0.1).all() and covariance.trace() < 1.0
         assert 0 < journey["heading_sigma_deg"] < 0.2
         assert abs(journey["heading_deg"]) < 5 * journey["heading_sigma_deg"]
-        assert set(journey["sigma_scale"]) == {"bias", "drift", "rotation"}
+        scales = dict(journey["sigma_scale"])
+        assert set(scales.pop("at_bound")) <= set(scales)
+        assert set(scales) == {"bias", "drift", "rotation", "noise", "rotation_noise"}
 
 
 def test_the_report_needs_nothing_else(run: Path):

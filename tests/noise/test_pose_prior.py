@@ -8,50 +8,16 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
+from worlds.pose_priors import GIVEN, make_prior
 from worlds.small_world import Builder
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.noise.pose_prior import (
-    DriftNodes,
-    PosePrior,
-    PosePriorConfig,
-    pose_prior,
-    stated_sigmas,
-)
-from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.noise.pose_prior import PosePrior, stated_sigmas
 from crowdmap_torch.optim.linearize import linearize
 from crowdmap_torch.optim.problem import Problem, Variable, euclidean
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 F64 = torch.float64
-WAY_M, SPACING_M = 900.0, 3.0
-GIVEN = torch.tensor([0.39, 0.39, 0.49], dtype=F64)
-"""What each journey's module says of its position [m]: bias and drift together."""
-
-
-def make_prior(
-    journeys: int,
-    config: PosePriorConfig | None = None,
-    *,
-    way_m: float = WAY_M,
-    spacing_m: float = SPACING_M,
-) -> PosePrior:
-    """Journeys along one road, a node every few metres."""
-    count = int(way_m / spacing_m)
-    way = (spacing_m * torch.arange(count)).to(F64).repeat(journeys)
-    owner = torch.arange(journeys).repeat_interleave(count)
-    every = torch.arange(len(way))
-    nodes = DriftNodes(every, every, owner, way)
-    drive = Builder().drive("j", frames=3).journey
-    drive = replace(
-        drive,
-        sigma_position=GIVEN.repeat(3, 1),
-        sigma_rotation=torch.full((3,), math.radians(0.2), dtype=F64),
-    )
-    pose = torch.eye(4, dtype=F64).expand(len(way), 4, 4)
-    return pose_prior(
-        [drive] * journeys, pose, nodes, spacing_m, PositioningNoise(), config or PosePriorConfig()
-    )
 
 
 def rescaled(prior: PosePrior, drift: Tensor, scale: Tensor) -> Tensor:
@@ -88,7 +54,11 @@ def drawn(prior: PosePrior, scale: Tensor, seed: int) -> Tensor:
 def test_the_prior_of_the_drift_is_bias_and_chain():
     prior = make_prior(1)
     scale = torch.tensor([[1.5, 0.5, 2.0]], dtype=F64)
-    terms = {k: t for k, t in prior.terms(scale).items() if k != "pose_white"}
+    terms = {
+        k: t
+        for k, t in prior.terms(scale, torch.ones(len(scale), 2, dtype=F64)).items()
+        if k != "pose_white"
+    }
     variables = {name: Variable(6, euclidean) for name in ("drift", "bias")}
     values = {
         "drift": torch.zeros(len(prior.nodes.way), 6, dtype=F64),
@@ -184,33 +154,6 @@ def test_what_nobody_saw_does_not_narrow_a_scale():
     torch.testing.assert_close(nothing[:, 1:], ones[:, 1:])
 
 
-def test_changes_are_told_by_what_is_left_of_their_variance():
-    prior = make_prior(3)
-    scale = torch.tensor([[1.0, 2.0, 0.5]], dtype=F64).expand(3, 3)
-    changes = prior.sampled_changes()
-    journey = prior.nodes.journey[changes.pair]
-    assert torch.equal(journey[:, 0], journey[:, 1]) and set(journey.flatten().tolist()) == {
-        0,
-        1,
-        2,
-    }
-    gap = (prior.nodes.way[changes.pair[:, 1]] - prior.nodes.way[changes.pair[:, 0]])[:, None]
-    # Of a Gauss-Markov chain, by its sigma and its length.
-    sigma = prior.drift_sigma[journey[:, 0]] * scale[0, 1:].repeat_interleave(3)
-    of_prior = 2 * sigma.square() * (1 - torch.exp(-gap / prior.length_m[journey[:, 0]]))
-    for left, told in ((1.0, 0.0), (0.25, 0.75), (0.0, 1.0), (1.2, 0.0)):
-        found = prior.told(changes, left * of_prior, scale)
-        torch.testing.assert_close(found, torch.full((3, 6), told, dtype=F64))
-
-
-def test_no_more_changes_are_asked_for_than_are_solved_at_once():
-    short, long = (make_prior(2, way_m=way).sampled_changes() for way in (400.0, 9000.0))
-    assert short.columns == 3 and long.columns == 8
-    for changes, most in ((short, 3), (long, 8)):
-        assert torch.bincount(changes.column).tolist() == [2] * most
-    assert make_prior(2, way_m=50.0).sampled_changes().columns == 0
-
-
 def test_a_single_journey_says_nothing_of_its_sigmas():
     prior = make_prior(1)
     scale = torch.full((1, 3), 3.0, dtype=F64)
@@ -245,7 +188,7 @@ def test_what_all_journeys_share_errs_as_much_as_the_expected_scales_say(journey
 
 def test_poses_of_the_prior_cost_nothing():
     prior = make_prior(2)
-    terms = prior.terms(torch.ones(2, 3, dtype=F64))
+    terms = prior.terms(torch.ones(2, 3, dtype=F64), torch.ones(2, 2, dtype=F64))
     values = {
         "pose": prior.pose,
         "drift": torch.zeros(len(prior.nodes.way), 6, dtype=F64),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -54,3 +55,15 @@ def test_covariances_of_corners_are_symmetric_one_for_each_corner(metrics, tiny_
 def test_without_a_survey_there_are_no_figures(metrics):
     assert metrics["survey"] is None
     assert metrics["survey_clusters"] is None
+
+
+def test_scales_that_could_not_go_further_are_named(tiny: Dataset, tiny_result: MapResult):
+    white = torch.full_like(tiny_result.white_scale, 1.0)
+    prior = torch.full_like(tiny_result.prior_scale, 0.8)
+    prior[0, 1], prior[0, 2], white[0, 0] = 0.1, 10.0, 10.0
+    result = replace(tiny_result, prior_scale=prior, white_scale=white)
+    made = metrics_of(tiny, result, MapperConfig(), (), {}, None, None)
+    scales = [journey["sigma_scale"] for journey in plain(made)["journeys"]]
+    assert scales[0]["at_bound"] == ["drift", "rotation", "noise"]
+    assert scales[0]["drift"] == 0.1 and scales[1]["drift"] == 0.8
+    assert all(scale["at_bound"] == [] for scale in scales[1:])

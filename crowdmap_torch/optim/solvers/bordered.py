@@ -140,6 +140,10 @@ class BorderedNormalEquations:
         """Variances of changes along chains by the last factors, landmarks and border known."""
         return self.inner.variance_of_changes(changes)
 
+    def variance_of_leaves(self) -> Float[Tensor, "l k"]:
+        """Variance of each leaf's numbers less those of the block that carries it, landmarks and border known."""
+        return self.inner.variance_of_leaves()
+
     def _reduced(self, added: Float[Tensor, " z"]) -> Reduced:
         """The border's own system, by the last factors of the inner one."""
         x = self.inner.solve_eliminated(self.link)

@@ -222,6 +222,18 @@ class ChainNormalEquations:
         found = diagonal_of_inverse(self.structure, self.diagonal, self.link)
         return self.structure.unstack(found)[name]
 
+    def variance_of_leaves(self) -> Float[Tensor, "l k"]:
+        """Variance of each leaf's numbers less those of the block that carries it, landmarks and border known."""
+        plan = self.structure.plan
+        assert plan.carrier is not None
+        found = diagonal_of_inverse(self.structure, self.diagonal, self.link)
+        of_carrier = found[plan.leaf_count :][plan.carrier]
+        alone = torch.linalg.inv(self.diagonal[: plan.leaf_count])
+        # The leaf goes with its carrier by -H^-1 times their link.
+        lags = alone @ self.link[: plan.leaf_count]
+        lags.diagonal(dim1=-2, dim2=-1).add_(1)
+        return (alone + lags @ of_carrier @ lags.mT).diagonal(dim1=-2, dim2=-1)
+
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
         """Variances of the changes between blocks of chains, by the last factors: leaves marginalised, all else known."""
         like, k = self.eliminated_gradient, self.eliminated_gradient.shape[1]

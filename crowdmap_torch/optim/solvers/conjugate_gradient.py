@@ -192,6 +192,10 @@ class ConjugateGradientEquations:
         """Variances of changes along chains by the last factors, landmarks and border known."""
         return self.inner.variance_of_changes(changes)
 
+    def variance_of_leaves(self) -> Float[Tensor, "l k"]:
+        """Variance of each leaf's numbers less those of the block that carries it, landmarks and border known."""
+        return self.inner.variance_of_leaves()
+
     def samples(
         self, count: int, generator: torch.Generator, *, floor: float
     ) -> dict[str, Float[Tensor, "n k count"]]:

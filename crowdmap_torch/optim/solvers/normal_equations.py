@@ -178,6 +178,10 @@ class MapEquations(NormalEquations, Protocol):
         """Variances of changes along chains by the factors of the last step, landmarks and border known."""
         ...
 
+    def variance_of_leaves(self) -> Float[Tensor, "l k"]:
+        """Variance of each leaf's numbers less those of the block that carries it, landmarks and border known."""
+        ...
+
 
 @runtime_checkable
 class Backend(Protocol):

@@ -320,3 +320,29 @@ def test_changes_along_chains_vary_as_the_dense_inverse_says():
         for i in range(3):
             expected = P[a, i, a, i] + P[b, i, b, i] - 2 * P[a, i, b, i]
             assert float(found[k, i]) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_leaves_vary_about_what_carries_them_as_the_dense_inverse_says():
+    built, values, chain = problem([12, 7])
+    n, every = len(chain), torch.arange(len(chain))
+    weight = torch.full((n,), 9.0).double()
+    bound = CostTerm(difference, (("pose", every), ("drift", every)), (), weight)
+    moves = built.terms["odometry"]
+    (_, after), (_, before) = moves.slots
+    chained = replace(moves, slots=(("drift", after), ("drift", before)))
+    terms = {**built.terms, "odometry": chained, "bound": bound}
+    prior_of_drift = CostTerm(prior, (("drift", every),), (torch.zeros(n, 3).double(),), weight / 9)
+    built = Problem(
+        {**built.variables, "drift": Variable(3, euclidean)}, {**terms, "drift": prior_of_drift}
+    )
+    values = {**values, "drift": torch.zeros(n, 3).double()}
+    plan = EliminationPlan("drift", chain, "pose", every)
+    found = ChainBackend(plan).assemble(built, values).variance_of_leaves()
+    dense = DenseBackend().assemble(built, values)
+    at = torch.cat(
+        [dense.where.offset[name][:, None] + torch.arange(3) for name in ("pose", "drift")]
+    ).flatten()
+    P = torch.linalg.inv(dense.hessian[0][at[:, None], at])
+    less = torch.cat((torch.eye(3 * n), -torch.eye(3 * n)), dim=1).double()
+    expected = (less @ P @ less.T).diagonal().view(n, 3)
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-12)

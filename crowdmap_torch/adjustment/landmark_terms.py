@@ -1,0 +1,54 @@
+"""Terms on signs and lanes as they stand at the moment of a step: what an iteration holds on to, and lets go after it."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.adjustment.config import AdjustConfig
+from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.optim.robust import Tukey
+from crowdmap_torch.residuals import lane, sign_prior
+
+
+def size_class_term(size: Float[Tensor, "n 2"], config: AdjustConfig) -> dict[str, CostTerm]:
+    """Draws signs to the nearest of the usual sizes, where the configuration names some."""
+    size = size.detach()
+    classes = size.new_tensor(config.size_classes_m)
+    if not len(classes) or not len(size):
+        return {}
+    away = (size[:, None] / classes).log().square().sum(-1)
+    term = CostTerm(
+        sign_prior.size_class,
+        (("size", torch.arange(len(size), device=size.device)),),
+        (classes[away.argmin(1)],),
+        size.new_full((len(size),), 1 / config.size_class_sigma),
+        Tukey(config.tukey_c),
+        takes_rows=True,
+    )
+    return {"size_class": term}
+
+
+def slide_term(
+    T_world_camera: Float[Tensor, "p 4 4"],
+    control_world: Float[Tensor, "c 3"],
+    beside: Int[Tensor, " c"],
+    along: Float[Tensor, "c 3"],
+    config: AdjustConfig,
+) -> dict[str, CostTerm]:
+    """Keeps lanes from sliding along themselves within a step: nothing in the images says where they are.
+
+    Each control point is held, along its lane, to the pose `beside` it, at the place of the moment: so it is not pulled;
+    the map's covariance is taken without it.
+    """
+    index = torch.arange(len(beside), device=beside.device)
+    offset = (control_world - T_world_camera[beside, :3, 3]).detach()
+    term = CostTerm(
+        lane.lane_slide,
+        (("pose", beside), ("lane", index)),
+        (offset, along),
+        offset.new_full((len(offset),), 1 / config.lane_slide_m),
+        takes_rows=True,
+    )
+    return {"lane_slide": term}

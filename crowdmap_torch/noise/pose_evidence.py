@@ -1,0 +1,100 @@
+"""What observations tell of what positioning gets wrong: by how much the sigmas of its prior may be judged.
+
+An estimate follows its prior where nothing is seen, and says nothing of it. How much it does say is one less the share of
+the prior's variance that is left when all is observed; of many numbers, the sum of these shares is the effective number of
+well determined ones (MacKay, Bayesian Interpolation, 1992): what sums of squares are divided by.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch.noise.pose_prior import MOST_SCALE, PosePrior
+from crowdmap_torch.optim.solvers.normal_equations import ChainChanges, MapEquations
+
+_SAMPLED = 8
+"""Changes of a journey whose variances are asked for, at most."""
+_WHITE_TRUST = 24.0
+"""Well determined numbers that the noise from frame to frame as it is given counts as."""
+_WHITE_SCALES = (1.0, MOST_SCALE)
+"""Least and largest scale of that noise: narrower than it is given it gains nothing even where it is (docs/RESULTS.md)."""
+
+
+@dataclass(frozen=True)
+class PoseEvidence:
+    """What the observations of a bundle tell of its poses' errors, the landmarks known."""
+
+    told: Float[Tensor, "j 6"]
+    """By journey and number of a pose, the share of the drift's changes that observations tell."""
+    left: Float[Tensor, "p 6"]
+    """Variance that is left of every pose's deviation from its drift."""
+
+
+def pose_evidence(
+    prior: PosePrior, equations: MapEquations, scale: Float[Tensor, "j 3"]
+) -> PoseEvidence:
+    """That at the point of normal equations, which have been solved, with the prior's scales that they were made with."""
+    changes = sampled_changes(prior)
+    told = torch.ones_like(prior.bias_sigma)
+    if len(changes.pair):
+        told = share_told(prior, changes, equations.variance_of_changes(changes), scale)
+    return PoseEvidence(told, equations.variance_of_leaves())
+
+
+def sampled_changes(prior: PosePrior) -> ChainChanges:
+    """Some of the changes that scales are told by, spread over each journey: as many as are solved for at once."""
+    journey = prior.nodes.journey[prior.far[:, 0]]
+    _, of, count = torch.unique_consecutive(journey, return_inverse=True, return_counts=True)
+    rank = torch.arange(len(of), device=of.device) - (count.cumsum(0) - count)[of]
+    column = torch.where(count[of] > _SAMPLED, rank * _SAMPLED // count[of], rank)
+    starts = torch.ones_like(column, dtype=torch.bool)
+    starts[1:] = (column[1:] != column[:-1]) | (of[1:] != of[:-1])
+    return ChainChanges(prior.far[starts], column[starts])
+
+
+def share_told(
+    prior: PosePrior,
+    changes: ChainChanges,
+    variance: Float[Tensor, "q 6"],
+    scale: Float[Tensor, "j 3"],
+) -> Float[Tensor, "j 6"]:
+    """By journey and number of a pose, the share of changes that observations tell, not the prior at this `scale`.
+
+    `variance` is what is left of each change: of one that nothing tells of, the prior's own.
+    """
+    journey = prior.nodes.journey[changes.pair[:, 0]]
+    of_each = scale[:, 1:].repeat_interleave(3, dim=1)[journey].square()
+    share = 1 - variance / (of_each * prior.expected_changes(changes.pair))
+    total = share.new_zeros(len(scale), 6).index_add_(0, journey, share.clamp(0, 1))
+    return total / torch.bincount(journey, minlength=len(scale)).clamp_min(1)[:, None]
+
+
+def white_scales(
+    prior: PosePrior,
+    residual: Float[Tensor, "p 6"],
+    left: Float[Tensor, "p 6"],
+    scale: Float[Tensor, "j 3"],
+    white_scale: Float[Tensor, "j 2"],
+) -> Float[Tensor, "j 2"]:
+    """By journey, what the noise of positions and of rotations from frame to frame is to be multiplied by.
+
+    `residual` is the poses' deviation from their drift, in units of their noise at the present scales.
+    """
+    journey = prior.nodes.journey[prior.nodes.of_frame]
+    within = prior.within_stretch(scale)
+    noise = prior.white_sigma * white_scale.repeat_interleave(3, dim=1)
+    present = noise.square() + within
+    share = (1 - left / present[journey]).clamp(0, 1)
+
+    def summed(of_each: Float[Tensor, "p 6"]) -> Float[Tensor, "j 2"]:
+        total = of_each.new_zeros(len(scale), 6).index_add_(0, journey, of_each)
+        return total.view(-1, 2, 3).sum(-1)
+
+    grown = (summed(residual.square()) + _WHITE_TRUST) / (summed(share) + _WHITE_TRUST)
+    found = grown * present.view(-1, 2, 3).mean(-1) - within.view(-1, 2, 3).mean(-1)
+    given = prior.white_sigma.view(2, 3).square().mean(-1)
+    return (found / given).clamp_min(0).sqrt().clamp(*_WHITE_SCALES)
