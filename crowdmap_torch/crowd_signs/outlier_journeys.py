@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_median
+from crowdmap_torch.optim.robust import median_scale
 from crowdmap_torch.ranges import Count, Degrees, Deviations, Length, Settings, Share
 from crowdmap_torch.tables import Signs
 
@@ -118,9 +119,7 @@ def journey_statistics(
 
     def error(of_each: Float[Tensor, " m"]) -> Float[Tensor, " j"]:
         off = (of_each[common] - median(of_each)[of_common]).abs()
-        several = off[off.isfinite()]
-        spread = 1.4826 * several.median() if len(several) else several.sum()
-        return _OF_MEDIAN * spread / (count - 1).clamp_min(1).sqrt()
+        return _OF_MEDIAN * median_scale(off[off.isfinite()]) / (count - 1).clamp_min(1).sqrt()
 
     miss = (member.center_world - head.center_world).norm(dim=1)
     a, b = member.normal_world, head.normal_world
@@ -207,7 +206,7 @@ def _outlying(
     if len(known) < _LEAST_JOURNEYS:
         return torch.zeros_like(judged)
     centre = known.median()
-    usual = (spread * 1.4826 * (known - centre).abs().median()).expand_as(value)
+    usual = (spread * median_scale(known - centre)).expand_as(value)
     if error is not None:
         usual = (usual.square() + (_BY_CHANCE * error).square()).sqrt()
     return judged & ((value - centre).abs() > usual) & (value.abs() > floor)

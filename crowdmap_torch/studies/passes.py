@@ -24,12 +24,12 @@ from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.surveys import read_survey
-from crowdmap_torch.mapper import MapResult, build_map
+from crowdmap_torch.mapper import JourneyMap, build_map
 from crowdmap_torch.simulate.positioning import PositioningConfig, pose_errors
 from crowdmap_torch.studies.folder import StudyFolder, digest
 from crowdmap_torch.studies.recorded_errors import read_recorded_errors
 from crowdmap_torch.studies.tasks import Task
-from crowdmap_torch.tables import Dataset, Journey, Survey
+from crowdmap_torch.tables import Dataset, HdMap, Journey, Survey
 
 COPIES = 10
 """Journeys that one pass is made into."""
@@ -140,7 +140,7 @@ class MeasureDrives(Task):
         return {
             "single": _means(alone),
             "map": _means(adjusted),
-            "relative": self._relative(survey, result),
+            "relative": self._relative(survey, final, result.journey_maps),
         }
 
     def _local(
@@ -154,10 +154,11 @@ class MeasureDrives(Task):
             center_world, T_world_camera, drive.frame_number, surveyed, gate_m=self.gate_m
         )
 
-    def _relative(self, survey: Survey, result: MapResult) -> dict[str, Any]:
+    def _relative(
+        self, survey: Survey, final: HdMap, journey_maps: Sequence[JourneyMap]
+    ) -> dict[str, Any]:
         """In the world: relative errors of the drives' own maps, in the mean, and of the common one."""
-        final = certain_part(result.hd_map, self.config.min_confidence)
-        maps = [replace(final, signs=made.signs) for made in result.journey_maps]
+        maps = [replace(final, signs=made.signs) for made in journey_maps]
         figures = [
             evaluate_map(m, survey, gate_m=self.gate_m).signs.relative_center.total.mean
             for m in (final, *maps)

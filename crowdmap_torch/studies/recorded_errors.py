@@ -8,17 +8,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.formats.geodesy import (
     geodetic_from_ecef,
     local_from_ecef,
     local_from_geodetic,
 )
+from crowdmap_torch.io.formats.importers.comma2k19 import read_array, utc_ns
 from crowdmap_torch.tables import Origin
-
-_WEEK_S = 604_800.0
-_UTC_TO_GPS_S = 18.0 - 315_964_800.0
-"""GPS counts from 1980 on, and is ahead of UTC by 18 s since 2017, before comma2k19 was recorded."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +44,17 @@ def read_recorded_errors(folder: Path) -> RecordedErrors:
 
     When fixes arrived stands there too: that trembles by hundredths of a second, which is a quarter of a metre of the way.
     """
-    position = _array(folder / "global_pose" / "frame_positions", 3)
-    clock = _array(folder / "global_pose" / "frame_gps_times", 2)
+    position = read_array(folder, "global_pose/frame_positions", 3)
+    clock = read_array(folder, "global_pose/frame_gps_times", 2)
     # Latitude, longitude, speed, UTC [ms], height, course.
-    fix = _array(folder / "GNSS" / "live_gnss_ublox" / "value", 6)
+    fix = read_array(folder, "GNSS/live_gnss_ublox/value", 6)
     if len(position) != len(clock):
         raise InputError(f"{folder}: expected as many times as positions")
-    t_fix = fix[:, 3] * 1e-3 + _UTC_TO_GPS_S
-    t_position = clock @ [_WEEK_S, 1.0]
-    for t, what in ((t_position, "positions"), (t_fix, "fixes")):
-        if (np.diff(t) <= 0).any():
-            raise InputError(f"{folder}: expected {what} one after the other")
+    begins_ns, *_ = t_ns = utc_ns(folder, clock)
+    # Seconds from the first frame on.
+    t_position, t_fix = (t_ns - begins_ns) * 1e-9, fix[:, 3] * 1e-3 - begins_ns * 1e-9
+    if (np.diff(t_fix) <= 0).any():
+        raise InputError(f"{folder}: expected fixes one after the other")
     both = (t_fix >= t_position[0]) & (t_fix <= t_position[-1])
     if both.sum() < 2:
         raise InputError(f"{folder}: expected fixes at the times of the positions, found none")
@@ -67,17 +64,3 @@ def read_recorded_errors(folder: Path) -> RecordedErrors:
     t = t_fix[both]
     at_fix = np.stack([np.interp(t, t_position, axis) for axis in true.T], axis=-1)
     return RecordedErrors(t - t[0], measured - at_fix)
-
-
-def _array(path: Path, columns: int | None = None) -> np.ndarray:
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: cannot be read as a NumPy array ({one_line(error)})") from error
-    shape = (len(values),) if columns is None else (len(values), columns)
-    if values.shape != shape or values.dtype.kind not in "fi" or not np.isfinite(values).all():
-        raise InputError(
-            f"{path}: an array {values.dtype} {list(values.shape)}; expected finite numbers, "
-            f"{columns or 1} a row"
-        )
-    return values.astype(np.float64)

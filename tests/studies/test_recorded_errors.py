@@ -67,9 +67,13 @@ def test_a_long_drive_runs_through_the_record_and_back():
 @pytest.mark.parametrize(
     ("name", "array", "message"),
     [
-        ("GNSS/live_gnss_ublox/value", np.zeros((3, 5)), "expected finite numbers, 6 a row"),
+        ("GNSS/live_gnss_ublox/value", np.zeros((3, 5)), "expected float rows of 6"),
         ("global_pose/frame_gps_times", np.ones((3, 2)), "as many times as positions"),
-        ("global_pose/frame_gps_times", np.ones((200, 2)), "positions one after the other"),
+        (
+            "global_pose/frame_gps_times",
+            np.ones((200, 2)),
+            "its time is not after that of the row before",
+        ),
         (
             "GNSS/live_gnss_ublox/value",
             np.arange(12.0).reshape(2, 6),
@@ -88,5 +92,5 @@ def test_a_segment_that_is_none_is_one_line(
 
 
 def test_what_is_missing_is_named(tmp_path: Path):
-    with pytest.raises(InputError, match="frame_positions: cannot be read"):
+    with pytest.raises(InputError, match="frame_positions: the file is missing"):
         read_recorded_errors(tmp_path)

@@ -37,9 +37,9 @@ _MOVING_MPS = 3.0
 def read(sources: tuple[Path, ...], asked: Asked) -> Parts:
     """Poses and rig of one segment."""
     folder = the_one(sources, "the folder of a segment, with global_pose in it")
-    position = _array(folder, "frame_positions", (3,))
-    quaternion = _array(folder, "frame_orientations", (4,))
-    clock = _array(folder, "frame_gps_times", (2,))
+    position = read_array(folder, "global_pose/frame_positions", 3)
+    quaternion = read_array(folder, "global_pose/frame_orientations", 4)
+    clock = read_array(folder, "global_pose/frame_gps_times", 2)
     if not len(position) == len(quaternion) == len(clock):
         raise InputError(
             f"{folder / 'global_pose'}: {len(position)} positions, {len(quaternion)} orientations and "
@@ -51,7 +51,7 @@ def read(sources: tuple[Path, ...], asked: Asked) -> Parts:
         raise InputError(
             f"{folder / 'global_pose/frame_orientations'}: row {row} has length {length[row]:.4g}"
         )
-    t_ns = _times(folder, clock)
+    t_ns = utc_ns(folder, clock)
     T = np.tile(np.eye(4), (len(position), 1, 1))
     # The quaternion's real part comes first here.
     T[:, :3, :3], T[:, :3, 3] = rotations(np.roll(quaternion, -1, axis=1)), position
@@ -66,23 +66,30 @@ def read(sources: tuple[Path, ...], asked: Asked) -> Parts:
     return Parts(track=track, rig=rig, origin=origin)
 
 
-def _array(folder: Path, name: str, shape: tuple[int, ...]) -> Float[np.ndarray, "n k"]:
-    path = file_in(folder, f"global_pose/{name}")
+def read_array(folder: Path, name: str, columns: int) -> Float[np.ndarray, "n k"]:
+    """One of a segment's arrays of so many columns."""
+    path = file_in(folder, name)
     file_size(path, _MOST_BYTES)
     try:
         values = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path}: cannot be read as a NumPy array ({one_line(error)})") from error
-    if values.ndim != 2 or values.shape[1:] != shape or values.dtype.kind != "f" or not len(values):
+    if (
+        values.ndim != 2
+        or values.shape[1] != columns
+        or values.dtype.kind != "f"
+        or not len(values)
+    ):
         raise InputError(
-            f"{path}: an array {values.dtype} {list(values.shape)}; expected float rows of {shape[0]}"
+            f"{path}: an array {values.dtype} {list(values.shape)}; expected float rows of {columns}"
         )
     if (bad := ~np.isfinite(values).all(-1)).any():
         raise InputError(f"{path}: row {int(bad.argmax())} is not finite; expected finite numbers")
     return values.astype(np.float64)
 
 
-def _times(folder: Path, week_and_second: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+def utc_ns(folder: Path, week_and_second: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+    """Unix time of a segment's frames, one after the other."""
     week, second = week_and_second.T
     whole = (_GPS_EPOCH_S - _LEAP_S + week.astype(np.int64) * _WEEK_S) * 10**9
     t_ns = whole + np.rint(second * 1e9).astype(np.int64)
