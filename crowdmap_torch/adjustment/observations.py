@@ -156,7 +156,7 @@ def lane_point_observations(
         key = torch.ones_like(cell, dtype=torch.bool)
         key[1:] = cell[1:] != cell[:-1]
         points = journey.lane_points
-        rank = _rank_within(points.detection)
+        rank = rank_within(points.detection)
         count = torch.bincount(points.detection, minlength=len(journey.lanes))[points.detection]
         # Evenly spread ranks: kept where the scaled rank passes an integer.
         wanted = count.clamp_max(points_per_detection)
@@ -197,7 +197,7 @@ def spaced_frames(journey: Journey, used: Bool[Tensor, " f"], spacing: float) ->
     return kept
 
 
-def _rank_within(group: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
+def rank_within(group: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
     """Position of each row among the adjacent rows of its group."""
     index = torch.arange(len(group), device=group.device)
     first = torch.ones_like(group, dtype=torch.bool)

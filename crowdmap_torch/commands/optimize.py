@@ -41,6 +41,7 @@ from crowdmap_torch.processes.threads import one_core_each, repeatable
 from crowdmap_torch.ranges import Count, Workers, argument
 from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
+from crowdmap_torch.report.outcomes import sign_outcomes
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.record import record_of
 from crowdmap_torch.report.stages import keep_and_log, log_crowd
@@ -187,6 +188,8 @@ def _map(
         warnings = (*findings, *unsettled, *missing)
         metrics = metrics_of(dataset, result, config, watch.iterations, progress.seconds, *compared)
         folder.write_metrics({**metrics, "warnings": plain(warnings)})
+        with _spared("fates of detections"):
+            folder.write_outcomes(sign_outcomes(dataset, result, bundle, config))
         with _spared("report"):
             known = (progress.seconds, survey, truth, *compared)
             record = record_of(dataset, result, config, watch, *known, warnings=warnings)

@@ -80,18 +80,26 @@ _UNKNOWN = ("detections were left out", "see `pruned` in metrics.json")
 
 def sign_fates(dataset: Dataset, result: MapResult, config: MapperConfig) -> Counter[str]:
     """Where the sign detections of all files ended; the counts add up to their rows."""
+    total = _dropped(dataset, DROPPED_SIGN)
+    for names, fate in sign_fates_by_row(dataset, result, config):
+        total += _counted(names, fate)
+    return total
+
+
+def sign_fates_by_row(
+    dataset: Dataset, result: MapResult, config: MapperConfig
+) -> Iterator[tuple[tuple[str, ...], Int[Tensor, " d"]]]:
+    """For every journey names of fates, and which of them each of its sign detections had."""
     is_certain = result.hd_map.signs.confidence >= config.min_confidence
     outliers = {found.journey for found in result.first.crowd.report.outlier_journeys}
-    total = _dropped(dataset, DROPPED_SIGN)
     trusted = trusted_frames(dataset.journeys, result.first.crowd)
     for number, (journey, made, found) in enumerate(
         zip(dataset.journeys, result.journey_maps, result.associations, strict=True)
     ):
-        total += _fates(
+        yield _fates(
             *(made.sign_tracklets.label, made.sign_report.reason, triangulate.REASONS),
             *(found.sign, is_certain, trusted[number][journey.signs.frame], number in outliers),
         )
-    return total
 
 
 def lane_fates(dataset: Dataset, result: MapResult) -> Counter[str]:
@@ -103,10 +111,12 @@ def lane_fates(dataset: Dataset, result: MapResult) -> Counter[str]:
     for number, (journey, made, found) in enumerate(
         zip(dataset.journeys, result.journey_maps, result.associations, strict=True)
     ):
-        total += _fates(
-            *(made.lane_tracklets.label, made.lane_report.reason, reconstruct.REASONS),
-            *(found.lane, every.to(found.lane.device)),
-            *(trusted[number][journey.lanes.frame], number in outliers),
+        total += _counted(
+            *_fates(
+                *(made.lane_tracklets.label, made.lane_report.reason, reconstruct.REASONS),
+                *(found.lane, every.to(found.lane.device)),
+                *(trusted[number][journey.lanes.frame], number in outliers),
+            )
         )
     return total
 
@@ -162,8 +172,8 @@ def _fates(
     is_certain: Bool[Tensor, " n"],
     trusted: Bool[Tensor, " d"],
     is_outlier: bool,
-) -> Counter[str]:
-    """Fates of one journey's detections; of several that apply the last that was reached."""
+) -> tuple[tuple[str, ...], Int[Tensor, " d"]]:
+    """Names of fates, and that of each of one journey's detections; of several that apply the last that was reached."""
     kept = OUTLIER_JOURNEY if is_outlier else TOO_FEW_JOURNEYS
     names = (NO_TRACK, kept, *(_TRACK + why for why in reasons[1:]), OUTAGE, IMPROBABLE, MAPPED)
     # Reason 0 is that the tracklet was kept; label -1 reads the last slot.
@@ -172,6 +182,9 @@ def _fates(
     of_detection = of_track[label]
     if not is_outlier:
         of_detection = of_detection.masked_fill((of_detection == 1) & ~trusted, names.index(OUTAGE))
-    fate = torch.where(landmark >= 0, of_landmark[landmark], of_detection)
+    return names, torch.where(landmark >= 0, of_landmark[landmark], of_detection)
+
+
+def _counted(names: Sequence[str], fate: Int[Tensor, " d"]) -> Counter[str]:
     count = torch.bincount(fate, minlength=len(names)).tolist()
     return Counter({name: number for name, number in zip(names, count, strict=True) if number})

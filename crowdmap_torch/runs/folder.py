@@ -22,6 +22,7 @@ from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.landmarks import write_lanes, write_signs
 from crowdmap_torch.io.maps import write_map
 from crowdmap_torch.io.runs import write_associations, write_refined_poses, write_road_estimate
+from crowdmap_torch.io.sign_outcomes import NamedOutcomes, write_sign_outcomes
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import Truth, has_truth, read_associations, read_truth
 from crowdmap_torch.mapper import MapResult
@@ -32,6 +33,7 @@ from crowdmap_torch.tables import Dataset, HdMap, Origin, Survey
 
 _MAKES = (
     *("map", "map_clusters", "journeys", "associations.parquet", "config.yaml"),
+    "sign_detections.parquet",
     *("tensorboard", "metrics.json", "report.html", "calibration.json", "rigs"),
 )
 """What a result consists of."""
@@ -167,6 +169,10 @@ class RunFolder:
                 self.unfinished / name,
                 min_confidence=config.min_confidence,
             )
+
+    def write_outcomes(self, outcomes: NamedOutcomes) -> None:
+        """sign_detections.parquet."""
+        write_sign_outcomes(self.unfinished / "sign_detections.parquet", outcomes)
 
     def write_metrics(self, metrics: Mapping[str, object]) -> None:
         """metrics.json."""
