@@ -188,15 +188,13 @@ def _map(
         warnings = (*findings, *unsettled, *missing)
         metrics = metrics_of(dataset, result, config, watch.iterations, progress.seconds, *compared)
         folder.write_metrics({**metrics, "warnings": plain(warnings)})
-        with _spared("fates of detections"):
-            folder.write_outcomes(sign_outcomes(dataset, result, bundle, config))
         with _spared("report"):
+            folder.write_outcomes(sign_outcomes(dataset, result, bundle, config))
             known = (progress.seconds, survey, truth, *compared)
             record = record_of(dataset, result, config, watch, *known, warnings=warnings)
             write_report(folder.unfinished / folder.report.name, record)
     kept.finish()
-    print(f"map: {folder.map}")
-    print(f"report: {folder.report}")
+    print(f"map: {folder.map}\nreport: {folder.report}")
     return EMPTY_MAP if options.strict and missing else 0
 
 
