@@ -53,29 +53,48 @@ class ReadRoad:
         y = number(geometry, "y") + u * math.sin(hdg) + v * math.cos(hdg)
         return x, y, hdg + math.atan2(dv, du)
 
-    def world(self, s: float, t: float, z: float = 0.0) -> np.ndarray:
-        """A point at t on the tilted road, and z straight above it."""
+    def world(self, s: float, t: float, z: float = 0.0, h: float = 0.0) -> np.ndarray:
+        """A point at t on the tilted road, h square to it and z straight above."""
         x, y, hdg = self.line(s)
         height = polynomial(self.element.findall("elevationProfile/elevation"), "s", s)
         tilt = polynomial(self.element.findall("lateralProfile/superelevation"), "s", s)
-        level = t * math.cos(tilt)
-        return np.array(
-            [x - level * math.sin(hdg), y + level * math.cos(hdg), height + t * math.sin(tilt) + z]
-        )
+        level = t * math.cos(tilt) - h * math.sin(tilt)
+        up = t * math.sin(tilt) + h * math.cos(tilt)
+        return np.array([x - level * math.sin(hdg), y + level * math.cos(hdg), height + up + z])
 
-    def lanes(self) -> dict[int, ET.Element]:
-        return {int(lane.attrib["id"]): lane for lane in self.element.iter("lane")}
+    def section(self, s: float) -> ET.Element:
+        """The lane section that holds at a place: the last one that begins at or before it."""
+        sections = self.element.findall("lanes/laneSection")
+        return [section for section in sections if number(section, "s") <= s + 1e-9][-1]
+
+    def lanes(self, s: float = 0.0) -> dict[int, ET.Element]:
+        return {int(lane.attrib["id"]): lane for lane in self.section(s).iter("lane")}
 
     def borders(self, s: float) -> dict[int, float]:
         """The t of the outer border of every lane, and of lane 0."""
-        lanes = self.lanes()
+        lanes = self.lanes(s)
+        at = s - number(self.section(s), "s")
         t = {0: polynomial(self.element.findall("lanes/laneOffset"), "s", s)}
         for sign in (1, -1):
             for k in range(1, len(lanes)):
                 if sign * k in lanes:
-                    width = polynomial(lanes[sign * k].findall("width"), "sOffset", s)
+                    width = polynomial(lanes[sign * k].findall("width"), "sOffset", at)
                     t[sign * k] = t[sign * (k - 1)] + sign * width
         return t
+
+    def edges(self, s: float) -> list[np.ndarray]:
+        """Inner and outer edges of all lanes to drive on in the world, at the heights that lanes have."""
+        t, at = self.borders(s), s - number(self.section(s), "s")
+        found = []
+        for k, lane in self.lanes(s).items():
+            if k and lane.attrib["type"] != "none":
+                heights = [h for h in lane.findall("height") if number(h, "sOffset") <= at + 1e-9]
+                inner, outer = (
+                    number(heights[-1], name) if heights else 0.0 for name in ("inner", "outer")
+                )
+                inside = k - int(math.copysign(1, k))
+                found += [self.world(s, t[inside], h=inner), self.world(s, t[k], h=outer)]
+        return found
 
 
 def facing(signal: ET.Element, road: ReadRoad) -> np.ndarray:

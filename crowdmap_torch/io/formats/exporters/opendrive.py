@@ -14,24 +14,21 @@ import numpy as np
 from jaxtyping import Float
 
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.formats.exporters.attributes import add, add_cubics
 from crowdmap_torch.io.formats.exporters.carriageways import Carriageways, carriageways
 from crowdmap_torch.io.formats.exporters.features import Layer, lane_points, layers
 from crowdmap_torch.io.formats.exporters.head import head, json_text
-from crowdmap_torch.io.formats.exporters.reference_line import cubics
+from crowdmap_torch.io.formats.exporters.lane_sections import (
+    LINKS,
+    Ends,
+    add_lanes,
+    lane_ends,
+    neighbour,
+)
+from crowdmap_torch.io.formats.exporters.reference_line import cubics, value
 from crowdmap_torch.io.formats.exporters.roads import Road, roads
 from crowdmap_torch.io.formats.geodesy import FLATTENING, SEMI_MAJOR_M
 from crowdmap_torch.tables import HdMap, Origin
-
-MARKS = {
-    "solid": "solid",
-    "dashed": "broken",
-    "double": "solid solid",
-    "curb": "curb",
-    None: "custom",
-}
-"""Types of road marks by those of markers."""
-MARK_WIDTH_M = 0.12
-"""Of painted lines: a map does not say [m]."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +51,10 @@ def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     root = ET.Element("OpenDRIVE")
     _header(root, hd_map, points)
     feet = _feet(hd_map, every)
-    ends = [_ends(ways, road) for road in every]
+    ends = [lane_ends(ways, road) for road in every]
     for number, road in enumerate(every):
         element = _road(root, number, road, ends)
-        _lanes(element, number, road, ways, lanes, ends)
+        add_lanes(element, number, road, ways, lanes, ends)
         chosen = [row for row, foot in enumerate(feet) if foot and foot.road == number]
         if chosen:
             group = ET.SubElement(element, "signals")
@@ -74,14 +71,9 @@ def _losses(
     hd_map: HdMap, ways: Carriageways, every: list[Road], feet: list[_Foot | None]
 ) -> tuple[str, ...]:
     losses = []
-    used = {border for road in every for border in road.border}
-    alone = [row for row in range(len(ways.borders)) if row not in used]
-    if alone:
-        steps = (np.linalg.norm(np.diff(ways.points(b)[:, :2], axis=0), axis=1) for b in alone)
-        length = sum(float(step.sum()) for step in steps)
-        losses.append(
-            f"{length:.0f} m of markers without a lane beside them: marks belong to lanes"
-        )
+    alone = _without_lanes(ways, every)
+    if alone >= 1:
+        losses.append(f"{alone:.0f} m of markers without a lane beside them: marks belong to lanes")
     if len(hd_map.lanes):
         losses.append("control points and sigma_m of markers (the largest sigma is kept)")
     homeless = sum(foot is None for foot in feet)
@@ -95,11 +87,26 @@ def _losses(
     return tuple(losses)
 
 
+def _without_lanes(ways: Carriageways, every: list[Road]) -> float:
+    """Length of the markers beside which no lane is [m]."""
+    steps = [
+        np.linalg.norm(np.diff(ways.points(b), axis=0), axis=1) for b in range(len(ways.borders))
+    ]
+    for road in every:
+        for rank, border in enumerate(road.border):
+            spans = [span for span in road.span[max(0, rank - 1) : rank + 1] if span]
+            points = ways.points(border)
+            s = road.line.beside((points[1:, :2] + points[:-1, :2]) / 2)[0]
+            for low, high in spans:
+                steps[border] = np.where((s >= low) & (s <= high), 0.0, steps[border])
+    return float(sum(step.sum() for step in steps))
+
+
 def _header(root: ET.Element, hd_map: HdMap, points: list[np.ndarray]) -> None:
     every = np.concatenate((*points, hd_map.signs.center_world.detach().cpu().numpy()))[:, :2]
     low, high = (every.min(0), every.max(0)) if len(every) else (np.zeros(2), np.zeros(2))
     created = hd_map.provenance.get("created_at")
-    element = _add(
+    element = add(
         root,
         "header",
         revMajor=1,
@@ -113,7 +120,7 @@ def _header(root: ET.Element, hd_map: HdMap, points: list[np.ndarray]) -> None:
         west=low[0],
     )
     ET.SubElement(element, "geoReference").text = _projection(hd_map.origin)
-    _add(element, "userData", code="crowdmap", value=json_text(head(hd_map)))
+    add(element, "userData", code="crowdmap", value=json_text(head(hd_map)))
 
 
 def _projection(origin: Origin) -> str:
@@ -129,51 +136,9 @@ def _projection(origin: Origin) -> str:
     )
 
 
-def _ends(ways: Carriageways, road: Road) -> dict[str, dict[tuple[int, int], int]]:
-    """Points of each lane's two borders where the road begins and ends, and the lane's number."""
-    tips = []
-    for b, runs in zip(road.border, road.is_along, strict=True):
-        node = ways.nodes(b, not runs)
-        tips.append((int(node[0]), int(node[-1])))
-    numbers = _numbers(road)
-    return {
-        which: {(tips[c][k], tips[c + 1][k]): numbers[c] for c in range(len(road.cell))}
-        for k, which in enumerate(("start", "end"))
-    }
-
-
-def _numbers(road: Road) -> list[int]:
-    """Numbers of a road's lanes from left to right: positive to the left of the reference line."""
-    return [
-        road.middle - c if c < road.middle else road.middle - c - 1 for c in range(len(road.cell))
-    ]
-
-
-def _neighbour(
-    number: int, which: str, ends: list[dict[str, dict[tuple[int, int], int]]]
-) -> tuple[int, str, dict[int, int]] | None:
-    """The one road that meets an end of a road, with which of its ends, and how lanes go on."""
-    found = []
-    for other, tips in enumerate(ends):
-        for contact in ("start", "end"):
-            if (other, contact) == (number, which):
-                continue
-            lanes = {}
-            for tip, lane in ends[number][which].items():
-                # Where beginnings meet the other road is seen from its far side.
-                key = tip if contact != which else (tip[1], tip[0])
-                if key in tips[contact]:
-                    lanes[lane] = tips[contact][key]
-            if lanes:
-                found.append((other, contact, lanes))
-    return found[0] if len(found) == 1 else None
-
-
-def _road(
-    root: ET.Element, number: int, road: Road, ends: list[dict[str, dict[tuple[int, int], int]]]
-) -> ET.Element:
+def _road(root: ET.Element, number: int, road: Road, ends: list[Ends]) -> ET.Element:
     line = road.line
-    element = _add(
+    element = add(
         root,
         "road",
         name="",
@@ -182,15 +147,15 @@ def _road(
         junction=-1,
         rule="LHT" if road.is_left_hand else "RHT",
     )
-    links = [(name, _neighbour(number, which, ends)) for name, which in _LINKS]
+    links = [(name, neighbour(number, which, ends)) for name, which in LINKS]
     if any(near for _, near in links):
         link = ET.SubElement(element, "link")
         for name, near in links:
             if near:
-                _add(link, name, elementType="road", elementId=near[0] + 1, contactPoint=near[1])
+                add(link, name, elementType="road", elementId=near[0] + 1, contactPoint=near[1])
     plan = ET.SubElement(element, "planView")
     for k, c in enumerate(line.coefficient):
-        geometry = _add(
+        geometry = add(
             plan,
             "geometry",
             s=line.s[k],
@@ -202,73 +167,12 @@ def _road(
         powers = {
             f"{a}{axis}": c[p, j] for j, axis in enumerate("UV") for p, a in enumerate("abcd")
         }
-        _add(geometry, "paramPoly3", **powers, pRange="arcLength")
+        add(geometry, "paramPoly3", **powers, pRange="arcLength")
     profile = ET.SubElement(element, "elevationProfile")
-    _add_cubics(profile, "elevation", "s", cubics(line.s, line.height, line.slope))
+    add_cubics(profile, "elevation", "s", cubics(line.s, line.height, line.slope))
     lateral = ET.SubElement(element, "lateralProfile")
-    _add_cubics(lateral, "superelevation", "s", cubics(line.s, road.tilt, road.tilt_slope))
+    add_cubics(lateral, "superelevation", "s", cubics(line.s, road.tilt, road.tilt_slope))
     return element
-
-
-_LINKS = (("predecessor", "start"), ("successor", "end"))
-
-
-def _lanes(
-    element: ET.Element,
-    number: int,
-    road: Road,
-    ways: Carriageways,
-    lanes: Layer,
-    ends: list[dict[str, dict[tuple[int, int], int]]],
-) -> None:
-    # On a tilted road t is counted along its surface.
-    cos = np.cos(road.tilt)
-    t = road.aside / cos
-    slope = road.aside_slope / cos + t * np.tan(road.tilt) * road.tilt_slope
-    links = [(name, _neighbour(number, which, ends)) for name, which in _LINKS]
-    group = ET.SubElement(element, "lanes")
-    if road.border[road.middle] != road.guide:
-        offset = cubics(road.line.s, t[road.middle], slope[road.middle])
-        _add_cubics(group, "laneOffset", "s", offset)
-    section = _add(group, "laneSection", s=0.0)
-    numbers = _numbers(road)
-    groups = (
-        ("left", [c for c in range(len(road.cell)) if numbers[c] > 0]),
-        ("center", []),
-        ("right", [c for c in range(len(road.cell)) if numbers[c] < 0]),
-    )
-    for name, cells in groups:
-        if name == "center":
-            lane = _add(ET.SubElement(section, name), "lane", id=0, type="none", level="false")
-            _mark(lane, ways.borders[road.border[road.middle]].piece, lanes)
-        elif cells:
-            side = ET.SubElement(section, name)
-            for c in cells:
-                is_two_way = ways.cells[road.cell[c]].is_two_way
-                kind = "bidirectional" if is_two_way else "driving"
-                lane = _add(side, "lane", id=numbers[c], type=kind, level="false")
-                joined = [
-                    (n, near[2][numbers[c]]) for n, near in links if near and numbers[c] in near[2]
-                ]
-                if joined:
-                    link = ET.SubElement(lane, "link")
-                    for n, other in joined:
-                        _add(link, n, id=other)
-                width = cubics(road.line.s, t[c] - t[c + 1], slope[c] - slope[c + 1])
-                _add_cubics(lane, "width", "sOffset", width)
-                outer = road.border[c if numbers[c] > 0 else c + 1]
-                _mark(lane, ways.borders[outer].piece, lanes)
-
-
-def _mark(lane: ET.Element, piece: int, lanes: Layer) -> None:
-    known = {name: column[piece] for name, column in lanes.columns.items()}
-    known["max_sigma_m"] = max(lanes.lists["sigma_m"][piece])
-    kind = MARKS[lanes.columns["type"][piece]]
-    width = {} if kind == "curb" else {"width": MARK_WIDTH_M}
-    mark = _add(
-        lane, "roadMark", sOffset=0.0, type=kind, weight="standard", color="standard", **width
-    )
-    _add(mark, "userData", code="crowdmap", value=json_text(known))
 
 
 def _bottoms(hd_map: HdMap) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
@@ -307,15 +211,15 @@ def _signal(
     roll = float(np.arctan2(R[2, 1], R[2, 2]))
     along_line = float(np.cos(heading - road.line.heading_at(s)[0]))
     base = float(road.line.heading_at(s)[0]) + (0.0 if along_line >= 0 else np.pi)
-    tilt = _value(cubics(road.line.s, road.tilt, road.tilt_slope), foot.s)
-    ground = _value(cubics(road.line.s, road.line.height, road.line.slope), foot.s)
+    tilt = value(cubics(road.line.s, road.tilt, road.tilt_slope), foot.s)
+    ground = value(cubics(road.line.s, road.line.height, road.line.slope), foot.s)
     known = {name: column[row] for name, column in signs.columns.items()}
     code = known["type"]
     country, _, rest = (code or "").rpartition(":")
     is_iso = (
         len(country) in (2, 3) and country.isascii() and country.isalpha() and country.isupper()
     )
-    signal = _add(
+    signal = add(
         group,
         "signal",
         id=row + 1,
@@ -335,26 +239,5 @@ def _signal(
         subtype="-1",
     )
     place = dict(zip("xyz", bottom.tolist(), strict=True))
-    _add(signal, "positionInertial", **place, hdg=heading, pitch=pitch, roll=roll)
-    _add(signal, "userData", code="crowdmap", value=json_text(known))
-
-
-def _value(rows: Float[np.ndarray, "_ 5"], s: float) -> float:
-    """Cubics as `cubics` gives them, at one place."""
-    s0, a, b, c, d = rows[max(0, int(np.searchsorted(rows[:, 0], s, side="right")) - 1)]
-    p = s - s0
-    return float(a + p * (b + p * (c + p * d)))
-
-
-def _add_cubics(parent: ET.Element, name: str, s: str, rows: Float[np.ndarray, "_ 5"]) -> None:
-    for row in rows.tolist():
-        _add(parent, name, **dict(zip((s, *"abcd"), row, strict=True)))
-
-
-def _add(parent: ET.Element, tag: str, /, **attributes: object) -> ET.Element:
-    """A child with attributes; numbers to the last digit."""
-    texts = {
-        key: repr(float(value)) if isinstance(value, float | np.floating) else str(value)
-        for key, value in attributes.items()
-    }
-    return ET.SubElement(parent, tag, texts)
+    add(signal, "positionInertial", **place, hdg=heading, pitch=pitch, roll=roll)
+    add(signal, "userData", code="crowdmap", value=json_text(known))

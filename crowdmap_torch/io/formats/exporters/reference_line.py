@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from numpy.polynomial import Polynomial
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
@@ -14,6 +15,8 @@ KNOT_SPACING_M = 4.0
 _LENGTH_ROUNDS = 6
 _FOOT_ROUNDS = 8
 _DENSE_M = 0.5
+_SAME = 2e-6
+"""Coefficients that differ less are those of one cubic, and what changes less is constant."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
@@ -60,6 +63,13 @@ class ReferenceLine:
         tangent = self.at(s)[1]
         return np.arctan2(tangent[:, 1], tangent[:, 0])
 
+    def height_at(self, s: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Heights of the line, straight on beyond its ends."""
+        inside = np.clip(s, 0, self.length)
+        rows = cubics(self.s, self.height, self.slope)
+        beyond = np.where(s < 0, self.slope[0], self.slope[-1]) * (s - inside)
+        return np.array([value(rows, at) for at in inside]) + beyond
+
     def beside(
         self, point: Float[np.ndarray, "n 2"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -77,12 +87,14 @@ class ReferenceLine:
         return s, t
 
 
-def reference_line(point_world: Float[np.ndarray, "n 3"], first: int, last: int) -> ReferenceLine:
-    """The smooth line through points `first` to `last` of a marker; those around them shape its ends."""
+def reference_line(
+    point_world: Float[np.ndarray, "n 3"], first: float, last: float
+) -> ReferenceLine:
+    """The smooth line through points `first` to `last` of a marker, fractions between two; those around shape its ends."""
     way = np.cumsum([0, *np.linalg.norm(np.diff(point_world[:, :2], axis=0), axis=1)])
+    begin, end = np.interp((first, last), np.arange(len(way)), way)
     curve = CubicSpline(way, point_world)
-    span = way[last] - way[first]
-    knot = np.linspace(way[first], way[last], max(1, int(np.ceil(span / KNOT_SPACING_M))) + 1)
+    knot = spread(begin, end)
     place, change = curve(knot), curve(knot, 1)
     speed = np.linalg.norm(change[:, :2], axis=1)
     tangent = change[:, :2] / speed[:, None]
@@ -112,6 +124,11 @@ def reference_line(point_world: Float[np.ndarray, "n 3"], first: int, last: int)
     )
 
 
+def spread(first: float, last: float) -> Float[np.ndarray, " k"]:
+    """Places from `first` to `last`, equally far apart, `KNOT_SPACING_M` at the most."""
+    return np.linspace(first, last, max(1, int(np.ceil((last - first) / KNOT_SPACING_M))) + 1)
+
+
 def _powers(
     step: Float[np.ndarray, "k 2"], out: Float[np.ndarray, "k 2"], m: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "k 3 2"]:
@@ -129,7 +146,9 @@ def cubics(
     rise = np.diff(value) / h
     c = (3 * rise - 2 * slope[:-1] - slope[1:]) / h
     d = (slope[:-1] + slope[1:] - 2 * rise) / h**2
-    rows = np.column_stack((s[:-1], value[:-1], slope[:-1], c, d))
+    change = np.abs(slope[:-1] * h) + np.abs(c * h**2) + np.abs(d * h**3)
+    powers = np.where((change < _SAME)[:, None], 0.0, np.column_stack((slope[:-1], c, d)))
+    rows = np.column_stack((s[:-1], value[:-1], powers))
     kept = [rows[0]]
     for row in rows[1:]:
         _, a, b, cc, dd = kept[-1]
@@ -145,5 +164,7 @@ def cubics(
     return np.array(kept)
 
 
-_SAME = 2e-6
-"""Coefficients that differ less are those of one cubic."""
+def value(rows: Float[np.ndarray, "_ 5"], s: float, derivative: int = 0) -> float:
+    """Cubics as `cubics` gives them, or their derivative, at one place."""
+    s0, *powers = rows[max(0, int(np.searchsorted(rows[:, 0], s, side="right")) - 1)]
+    return float(Polynomial(powers).deriv(derivative)(s - s0))
