@@ -129,6 +129,9 @@ class MapResult:
     control_points: int = 0
     """Surveyed signs that pin the map."""
 
+    def __repr__(self) -> str:
+        return f"MapResult({self.hd_map!r} of {len(self.poses)} journeys: {self.state.reasons[0]})"
+
 
 @one_core_each()
 def build_map(
@@ -342,6 +345,8 @@ def finish_map(
         for journey, m, pose, association in zip(journeys, maps, poses, associations, strict=True)
     )
     provenance = {"config": config_hash(config), "journeys": [j.journey_id for j in journeys]}
+    if dataset.bbox is not None:
+        provenance["bbox"] = [*dataset.bbox]
     shared = uncertainty.shared
     hd_map = as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
     clusters = clusters_map(dataset, replace(first, associations=associations), provenance)

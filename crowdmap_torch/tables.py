@@ -17,6 +17,7 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.geometry.extent import extent
 
 LANE_TYPES = ("solid", "dashed", "double", "curb")
 """Lane types by code; -1 is unknown."""
@@ -34,6 +35,13 @@ class Rows:
     def __getitem__(self: Table, index: Tensor) -> Table:
         """The rows at `index` (a mask or row numbers), in that order."""
         return self._map(lambda column: column[index])
+
+    def __init_subclass__(cls) -> None:
+        # Before the dataclass is made, which would otherwise show every number.
+        cls.__repr__ = Rows.__repr__
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self):,} rows)"
 
     def to(self: Table, device: torch.device | str) -> Table:
         """The same table on another device."""
@@ -153,6 +161,9 @@ class Journey:
     vehicle_id: str = ""
     """Whose drives share a calibration; empty: those of the rig do."""
 
+    def __repr__(self) -> str:
+        return f"Journey({self.journey_id!r}: {_driven((self,))})"
+
     @property
     def vehicle(self) -> str:
         """The name of what its calibration is of."""
@@ -165,29 +176,21 @@ class Journey:
 
     def with_frames(self, frames: Int[Tensor, " k"]) -> Journey:
         """The journey with these of its frames, by row, each with all that was detected in it; one may come again."""
-
-        def rows_of(frame: Tensor) -> tuple[Tensor, Tensor]:
-            new, row = torch.nonzero(frame == frames[:, None], as_tuple=True)
-            return row, new
-
-        def of_frames(of_each: Tensor | None) -> Tensor | None:
-            return None if of_each is None else of_each[frames]
-
-        sign_row, sign_frame = rows_of(self.signs.frame)
-        lane_row, lane_frame = rows_of(self.lanes.frame)
-        detection, point = torch.nonzero(
-            self.lane_points.detection == lane_row[:, None], as_tuple=True
-        )
+        sign_frame, sign_row = torch.nonzero(frames[:, None] == self.signs.frame, as_tuple=True)
+        lane_frame, lane_row = torch.nonzero(frames[:, None] == self.lanes.frame, as_tuple=True)
+        owner, point = torch.nonzero(lane_row[:, None] == self.lane_points.detection, as_tuple=True)
+        sigmas = (self.sigma_position, self.sigma_rotation)
+        sigma_position, sigma_rotation = (None if s is None else s[frames] for s in sigmas)
         return replace(
             self,
             frame_number=self.frame_number[frames],
             t_ns=self.t_ns[frames],
             T_world_camera=self.T_world_camera[frames],
-            sigma_position=of_frames(self.sigma_position),
-            sigma_rotation=of_frames(self.sigma_rotation),
+            sigma_position=sigma_position,
+            sigma_rotation=sigma_rotation,
             signs=replace(self.signs[sign_row], frame=sign_frame, row=torch.arange(len(sign_row))),
             lanes=replace(self.lanes[lane_row], frame=lane_frame, row=torch.arange(len(lane_row))),
-            lane_points=replace(self.lane_points[point], detection=detection),
+            lane_points=replace(self.lane_points[point], detection=owner),
             dropped={},
         )
 
@@ -320,6 +323,11 @@ class HdMap:
     """The part of every position's covariance that all journeys share [m^2]."""
     provenance: dict
 
+    def __repr__(self) -> str:
+        place = torch.cat((self.signs.center_world, self.lanes.control.point_world))
+        what = f"{len(self.signs):,} signs, {len(self.lanes):,} lane pieces"
+        return f"HdMap({what}, {extent(place)} at {self.origin})"
+
 
 @dataclass(frozen=True)
 class Origin:
@@ -355,6 +363,12 @@ class Dataset:
     rejected: tuple[RejectedJourney, ...]
     type_names: tuple[str, ...]
     """Traffic-sign codes that occur, by code of the `type` columns."""
+    bbox: tuple[float, float, float, float] | None = None
+    """West, south, east and north [m] of the part of the world that it was cut to; None: it is whole."""
+
+    def __repr__(self) -> str:
+        what = f"{len(self.journeys):,} journeys, {len(self.rejected):,} set aside"
+        return f"Dataset({what}, {_driven(self.journeys)} at {self.origin})"
 
 
 @dataclass(frozen=True)
@@ -398,6 +412,11 @@ class Survey:
     """Index into `LANE_TYPES`; -1 unknown."""
     lane_points: SurveyLanePoints
 
+    def __repr__(self) -> str:
+        place = torch.cat((self.signs.center_world, self.lane_points.point_world))
+        what = f"{len(self.signs):,} signs, {len(self.lane_id):,} lane markers"
+        return f"Survey({what}, {extent(place)} at {self.origin})"
+
 
 @dataclass(frozen=True)
 class Association:
@@ -420,3 +439,11 @@ class RoadEstimate(Rows):
     """Distance from the camera centre to the road plane along it [m]."""
     sigma: Float[Tensor, " f"]
     """1-sigma of the normal's angle [rad]."""
+
+
+def _driven(journeys: Sequence[Journey]) -> str:
+    frames, signs, lanes = (
+        sum(len(getattr(j, name)) for j in journeys) for name in ("t_ns", "signs", "lanes")
+    )
+    place = torch.cat([j.T_world_camera[:, :3, 3] for j in journeys] or [torch.zeros(0, 3)])
+    return f"{frames:,} frames, {signs:,} sign and {lanes:,} lane detections, {extent(place)}"

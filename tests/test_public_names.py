@@ -45,7 +45,8 @@ def test_an_unknown_name_is_an_attribute_error():
 
 def test_the_package_is_imported_without_what_it_stands_on():
     code = (
-        "import sys, crowdmap_torch; print(sorted({'torch', 'numpy', 'pyarrow'} & {*sys.modules}))"
+        "import sys, crowdmap_torch; "
+        "print(sorted({'torch', 'numpy', 'pyarrow', 'sklearn', 'matplotlib'} & {*sys.modules}))"
     )
     ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert ended.stdout == "[]\n"

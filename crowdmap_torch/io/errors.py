@@ -24,6 +24,17 @@ _LONGEST = 1000
 
 
 @contextmanager
+def needing(what: str, package: str) -> Iterator[None]:
+    """Inside, packages that `what` stands on are imported: InputError where one is missing, and how pip installs it."""
+    try:
+        yield
+    except ModuleNotFoundError as missing:
+        raise InputError(
+            f"{what} needs the Python package {missing.name!r}, which is not installed: pip install {package}"
+        ) from missing
+
+
+@contextmanager
 def input_read() -> Iterator[None]:
     """Inside, a value or a file that is wrong is wrong input: a ValueError or OSError leaves as an InputError."""
     try:

@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -24,7 +25,7 @@ from crowdmap_torch.evaluation.signs import SignComparison
 from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.summaries import JourneySummary
-from crowdmap_torch.tables import HdMap, Survey
+from crowdmap_torch.tables import Dataset, HdMap, Survey
 
 MAP, SURVEY, BEFORE, WRONG, FAINT, INK = (
     "#2563c9",
@@ -41,6 +42,8 @@ _CELLS_ACROSS = 24
 """Of an image, in the plot of residuals over it."""
 _LEAST_IN_A_CELL = 5
 _MOST_DOTS = 20_000
+_MOST_NAMED = 12
+"""Journeys that a legend names."""
 
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": "#9aa4b2",
@@ -95,6 +98,29 @@ def plot_map(hd_map: HdMap, survey: Survey | None = None, *, title: str = "") ->
     if survey is not None:
         axes.legend(loc="upper right")
     return figure
+
+
+@styled
+def plot_dataset(dataset: Dataset) -> Figure:
+    """Drives from above, as the positioning module has them."""
+    figure, (axes,) = new_figure(1, width=9.0, height=5.0)
+    for journey, color in zip(dataset.journeys, cycle(SERIES)):
+        x, y = journey.T_world_camera[:, :2, 3].cpu().unbind(-1)
+        axes.plot(x, y, color=color, lw=1.0, label=journey.journey_id)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="east [m]", ylabel="north [m]", title=f"{len(dataset.journeys)} journeys")
+    if 0 < len(dataset.journeys) <= _MOST_NAMED:
+        axes.legend(loc="best")
+    return figure
+
+
+def plot(what: HdMap | Dataset, survey: Survey | None = None) -> Figure:
+    """A map, with a survey under it, or the drives of a dataset, from above; TypeError for anything else."""
+    if isinstance(what, HdMap):
+        return plot_map(what, survey)
+    if isinstance(what, Dataset):
+        return plot_dataset(what)
+    raise TypeError(f"expected a map or a dataset, found {type(what).__name__}")
 
 
 @styled

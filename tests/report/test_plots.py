@@ -17,7 +17,7 @@ from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.plots import Eigengap, sign_errors
 from crowdmap_torch.report.record import RunRecord
 from crowdmap_torch.report.summaries import JourneySummary
-from crowdmap_torch.tables import Survey
+from crowdmap_torch.tables import Dataset, Survey
 
 
 def over_image() -> tuple[torch.Tensor, torch.Tensor]:
@@ -50,6 +50,15 @@ def test_every_plot_can_be_an_svg_and_an_image(record):
         assert image.ndim == 3
         assert image.shape[2] == 3
         assert image.std() > 0
+
+
+def test_a_map_and_drives_are_plotted_and_nothing_else(record: RunRecord, tiny: Dataset):
+    (axes,) = plots.plot(record.hd_map, record.survey).axes
+    assert axes.get_legend_handles_labels()[1] == ["survey", "map"]
+    (axes,) = plots.plot(tiny).axes
+    assert [line.get_label() for line in axes.lines] == [j.journey_id for j in tiny.journeys]
+    with pytest.raises(TypeError):
+        plots.plot("map")  # pyright: ignore[reportArgumentType]
 
 
 def test_arrows_over_the_image_are_medians_where_corners_were_seen():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crowdmap_torch.io.atomic import atomic_file, atomic_folder
-from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.errors import InputError, needing
 from crowdmap_torch.io.formats.exporters.trajectories import write_kitti, write_tum
 from crowdmap_torch.tables import HdMap
 
@@ -44,13 +44,8 @@ def export_map(hd_map: HdMap, path: Path, to: str) -> tuple[str, ...]:
     """
     if to not in FORMATS:
         raise InputError(f"format {to!r} is unknown; expected one of {', '.join(FORMATS)}")
-    try:
+    with needing(FORMATS[to].title, f"'crowdmap_torch[{FORMATS[to].extra}]'"):
         module = importlib.import_module(f"{__package__}.{to}")
-    except ModuleNotFoundError as missing:
-        raise InputError(
-            f"{FORMATS[to].title} needs the Python package {missing.name!r}, which is not installed: "
-            f"pip install 'crowdmap_torch[{FORMATS[to].extra}]'"
-        ) from missing
     with atomic_folder(path) if FORMATS[to].is_folder else atomic_file(path) as beside:
         return module.write(hd_map, beside)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from crowdmap_torch.geometry import polygon, se3, spline_length
 from crowdmap_torch.io.formats.geodesy import geodetic_from_local
 from crowdmap_torch.io.landmarks import POINT_SPACING_M
-from crowdmap_torch.tables import LANE_TYPES, HdMap, Lanes, Signs
+from crowdmap_torch.tables import LANE_TYPES, HdMap, Lanes, Origin, Signs
 
 LAYERS = ("signs", "plates", "lanes")
 """Signs as points, their plates as polygons, lane markers as lines."""
@@ -100,6 +100,16 @@ def heading_deg(normal_world: Float[Tensor, "n 3"]) -> list[float]:
     return [math.degrees(math.atan2(e, n)) % 360 for e, n, _ in normal_world.tolist()]
 
 
+def geographic(
+    points_world: list[Float[np.ndarray, "_ 3"]], origin: Origin
+) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+    """Longitude [deg], latitude [deg] and height [m] of every feature's points."""
+    if not points_world:
+        return ()
+    place = geodetic_from_local(np.concatenate(points_world), origin)[:, [1, 0, 2]]
+    return tuple(np.split(place, np.cumsum([len(points) for points in points_world])[:-1]))
+
+
 def _layer(
     hd_map: HdMap,
     name: str,
@@ -109,11 +119,7 @@ def _layer(
     columns: dict[str, list],
     lists: dict[str, list[list]],
 ) -> Layer:
-    place = np.empty((0, 3))
-    if points_world:
-        place = geodetic_from_local(np.concatenate(points_world), hd_map.origin)[:, [1, 0, 2]]
-    ends = np.cumsum([len(points) for points in points_world])[:-1]
-    places = tuple(np.split(place, ends)) if points_world else ()
+    places = geographic(points_world, hd_map.origin)
     return Layer(name, geometry, feature_id, places, columns, lists)
 
 

@@ -23,7 +23,7 @@ _DEGREES, _METRES = 10, 5
 def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     """Writes a feature collection, one feature a line; nothing is left out."""
     lines = ",\n".join(
-        json_text(feature) for layer in layers(hd_map) for feature in _features(layer)
+        json_text(feature) for layer in layers(hd_map) for feature in features(layer)
     )
     path.write_text(
         f'{{"type":"FeatureCollection","crowdmap":{json_text(head(hd_map))},"features":[\n{lines}\n]}}\n',
@@ -32,7 +32,8 @@ def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     return ()
 
 
-def _features(layer: Layer) -> Iterator[dict]:
+def features(layer: Layer) -> Iterator[dict]:
+    """The features of a layer, as GeoJSON has them."""
     for row, (name, place) in enumerate(zip(layer.feature_id, layer.place, strict=True)):
         properties = {key: column[row] for key, column in (layer.columns | layer.lists).items()}
         yield {
