@@ -1,5 +1,7 @@
 """Maps a dataset: `crowdmap optimize DATASET --out RUN [--config configs/NAME.yaml] [--device cpu|cuda]`.
 
+Counts and figures are printed on stdout, progress and what looks wrong on stderr.
+
 Reads like a training loop: load, map each journey, tell the landmarks of all journeys apart, then adjust everything at
 once, step by step, watched in TensorBoard; last the map, its errors against the survey, and a report. `RUN` is
 described in FORMAT.md.
@@ -8,6 +10,7 @@ described in FORMAT.md.
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,10 +30,11 @@ from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.config import MapperConfig, dump, load_config
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
+from crowdmap_torch.io.area import Area, Cut, cut_dataset, cut_truth, read_area
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
 from crowdmap_torch.io.documents import plain
-from crowdmap_torch.io.errors import input_read, one_line
+from crowdmap_torch.io.errors import InputError, input_read, one_line
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.noise.calibration import KnownCalibration
@@ -45,6 +49,7 @@ from crowdmap_torch.report.outcomes import sign_outcomes
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.record import record_of
 from crowdmap_torch.report.stages import keep_and_log, log_crowd
+from crowdmap_torch.report.summaries import counts_line
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.report.unsettled import unsettled_findings
 from crowdmap_torch.report.watch import Watch
@@ -69,8 +74,10 @@ EMPTY_MAP = 3
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap optimize` takes."""
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="a folder as in FORMAT.md")
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder to write")
+    parser.add_argument(
+        "dataset", type=Path, nargs="?", metavar="DATASET", help="a folder as in FORMAT.md"
+    )
+    parser.add_argument("--out", type=Path, metavar="RUN", help="folder to write")
     parser.add_argument("--config", type=Path, metavar="YAML", help="what differs from defaults")
     parser.add_argument(
         "--control", type=Path, metavar="MAP", help="surveyed signs that pin the map, as a survey"
@@ -79,6 +86,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--calibration",
         metavar="RUN|off",
         help="start from what an earlier run found of the cars; off: rig.yaml is right in all of them",
+    )
+    parser.add_argument(
+        "--journeys",
+        metavar="ID,ID...",
+        help="map these alone: ids, or patterns such as 2026-05-*, with commas between them",
+    )
+    parser.add_argument(
+        "--bbox",
+        type=_area,
+        metavar="E0,N0,E1,N1",
+        help="map what drives saw from inside this area alone [m east and north of the origin]",
     )
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
     parser.add_argument(
@@ -100,16 +118,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="errors and histograms every N steps",
     )
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress on stderr")
+    parser.add_argument(
+        "--print-config",
+        action="store_true",
+        help="print the whole configuration as YAML, defaults filled in, and do nothing else",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Maps `options.dataset` into the folder `options.out`; the exit code."""
     with input_read():
-        refuse_overlap(options.out, options.dataset)
-        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         config = load_config(options.config)
         if options.calibration == _OFF:
             config = replace(config, calibration=CalibrationConfig.off())
+    if options.print_config:
+        print(dump(config), end="")
+        return 0
+    if options.dataset is None or options.out is None:
+        missing = "DATASET" if options.dataset is None else "--out RUN"
+        raise InputError(f"{missing} is missing; see {options.prog} --help")
+    with input_read():
+        refuse_overlap(options.out, options.dataset)
+        folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
         device = _device(options.device)
     # The folder first: whether it can be written, and by nobody else, is known before anything is read at length.
     with keeping(folder.kept), folder.claimed(), one_core_each():
@@ -129,7 +160,7 @@ def _map(
         return 0
     findings = _looked_over(options.dataset, dataset, config)
 
-    progress = Progress()
+    progress = Progress(io.StringIO() if options.quiet else None)
     folder.prepare()
     kept.begin()
     with TensorBoardLog(folder.tensorboard) as log:
@@ -183,17 +214,17 @@ def _map(
         with _spared("figures"):
             compared = _compared(result, config, given, folder)
         progress.finish()
-        unsettled = _told(unsettled_findings(first), dataset)
         missing = _told(missing_findings(dataset, result, config), dataset)
-        warnings = (*findings, *unsettled, *missing)
+        warnings = (*findings, *_told(unsettled_findings(first), dataset), *missing)
         metrics = metrics_of(dataset, result, config, watch.iterations, progress.seconds, *compared)
-        folder.write_metrics({**metrics, "warnings": plain(warnings)})
+        folder.write_metrics({**metrics, "area": plain(given.cut), "warnings": plain(warnings)})
         with _spared("report"):
             folder.write_outcomes(sign_outcomes(dataset, result, bundle, config))
             known = (progress.seconds, survey, truth, *compared)
             record = record_of(dataset, result, config, watch, *known, warnings=warnings)
             write_report(folder.unfinished / folder.report.name, record)
     kept.finish()
+    print(counts_line(dataset, result, config))
     print(f"map: {folder.map}\nreport: {folder.report}")
     return EMPTY_MAP if options.strict and missing else 0
 
@@ -222,6 +253,8 @@ class _Given:
     """Surveyed signs that pin the map."""
     cars: Mapping[str, KnownCalibration]
     """What an earlier run found of their calibrations."""
+    cut: Cut | None
+    """What `--bbox` left out."""
 
     def beside(self, device: torch.device) -> _Beside:
         """What is known beside the drives, for the bundle."""
@@ -232,9 +265,13 @@ class _Given:
 def _read(options: argparse.Namespace, config: MapperConfig, device: torch.device) -> _Given:
     """What there is to map from, and to judge the map by."""
     with reading(config.reading, inside=options.dataset):
-        dataset = _load(options.dataset, device, strict=options.strict)
+        dataset = _load(options, device)
         survey = read_survey_of(options.dataset, dataset.origin)
-        truth = read_truth_of(options.dataset, dataset, survey)
+        truth, cut = read_truth_of(options.dataset, dataset, survey), None
+    if options.bbox is not None:
+        dataset, cut = cut_dataset(dataset, options.bbox)
+        truth = truth and cut_truth(truth, options.bbox)
+        print(cut)
     with reading(config.reading):
         control = options.control and read_survey_at(options.control, dataset.origin)
         is_known = (earlier := options.calibration) not in (None, _OFF)
@@ -243,13 +280,16 @@ def _read(options: argparse.Namespace, config: MapperConfig, device: torch.devic
     if is_known and new:
         names = ", ".join(new[:5]) + (f" and {len(new) - 5} others" if len(new) > 5 else "")
         print(f"warning: --calibration {earlier}: nothing is known of {names}", file=sys.stderr)
-    return _Given(dataset, survey, truth, control, cars)
+    return _Given(dataset, survey, truth, control, cars, cut)
 
 
-def _load(folder: Path, device: torch.device, *, strict: bool) -> Dataset:
+def _load(options: argparse.Namespace, device: torch.device) -> Dataset:
     """The dataset; every journey that is set aside is named, also where none is left."""
+    wanted = None if options.journeys is None else options.journeys.split(",")
     try:
-        dataset = load_dataset(folder, device=device, strict=strict)
+        dataset = load_dataset(
+            options.dataset, device=device, strict=options.strict, journeys=wanted
+        )
     except NoJourneyLeft as error:
         _tell_rejected(error.rejected)
         raise
@@ -303,6 +343,13 @@ def _compared(
     figures = figures_of(final, survey, truth, folder.unfinished, control)
     print(format_figures(figures))
     return figures, figures_of(before, survey, truth, None, control)
+
+
+def _area(text: str) -> Area:
+    try:
+        return read_area(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _device(name: str) -> torch.device:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import importlib
-from collections.abc import Mapping
+import re
+import sys
+from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
 from crowdmap_torch.io.errors import one_line
@@ -51,4 +53,16 @@ class ModuleParser(OneLineParser):
             self.error(f"needs the Python package {missing.name!r}, which is not installed")
         module.add_arguments(self)
         self.set_defaults(module=module, prog=self.prog)
-        return super().parse_known_args(args, namespace)
+        given = sys.argv[1:] if args is None else args
+        return super().parse_known_args(_negatives_joined(given), namespace)
+
+
+def _negatives_joined(arguments: Sequence[str]) -> list[str]:
+    """The same, with lists that begin below zero (`--bbox -50,0,50,90`) as values of the option before them."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and re.fullmatch(r"--[a-z-]+", joined[-1]) and re.match(r"-[\d.]+,", argument):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined

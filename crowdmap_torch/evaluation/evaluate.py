@@ -31,6 +31,7 @@ from crowdmap_torch.evaluation.single_journey import (
 )
 from crowdmap_torch.evaluation.uncertainty import evaluate_uncertainty
 from crowdmap_torch.evaluation.visibility import observable_signs, oracle_figures, seen_by_journeys
+from crowdmap_torch.io.area import area_of
 from crowdmap_torch.io.truth import SignAssociations, Truth
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.survey.matching import SurveyMatchConfig
@@ -58,7 +59,8 @@ def evaluate_map(
     `truth` holds the journeys in use of a simulated dataset: with it, what is observable, the
     oracle, associations (`associations.journey` indexes `truth.journeys`) and single-journey
     `landmarks` are judged too. Without it every surveyed sign is observable, unless
-    `observable_ids` names those that are. ValueError if the origins differ.
+    `observable_ids` names those that are. Of a map of a part of the world (`bbox` in its provenance) only what stands
+    inside that is. ValueError if the origins differ.
     """
     refuse_other_origin(hd_map.origin, survey.origin)
     hd_map, survey, truth = to_device((hd_map, survey, truth), "cpu")
@@ -69,6 +71,10 @@ def evaluate_map(
         observable = _rows_named(survey, observable_ids, "observable")
     elif truth is not None:
         observable = observable_signs(truth, survey.signs)
+    area = area_of(hd_map.provenance)
+    if area is not None:
+        inside = area.holds(survey.signs.center_world)
+        observable = inside if observable is None else observable & inside
     control = _rows_named(survey, control_ids, "control")
     comparison = compare_signs(
         hd_map.signs, survey.signs, observable=observable, control=control, config=config
@@ -183,8 +189,13 @@ def _evaluate_lanes(
         return None
     config = LaneEvaluationConfig()
     seen_by = None
+    samples = survey_samples(survey, config.step_m)
     if truth is not None:
-        seen_by = seen_by_journeys(truth, survey_samples(survey, config.step_m))
+        seen_by = seen_by_journeys(truth, samples)
+    area = area_of(hd_map.provenance)
+    if area is not None:
+        inside = area.holds(samples.point_world).long()
+        seen_by = inside * (config.min_journeys if seen_by is None else seen_by)
     return evaluate_lanes(
         hd_map.lanes,
         survey,

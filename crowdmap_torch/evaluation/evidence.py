@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from crowdmap_torch.evaluation.single_journey import JourneyLandmarks
+from crowdmap_torch.io.area import area_of, cut_truth
 from crowdmap_torch.io.datasets import load_journey, read_origin
 from crowdmap_torch.io.documents import read_json
 from crowdmap_torch.io.errors import InputError
@@ -55,6 +56,10 @@ def gather_evidence(
         return Evidence(notes=(note,))
     journeys, notes = _load_journeys(hd_map, survey_folder, dataset_folder)
     truth = read_truth(survey_folder, survey, journeys)
+    area = area_of(hd_map.provenance)
+    if area is not None:
+        truth = cut_truth(truth, area)
+        journeys = tuple(one.journey for one in truth.journeys)
     if run_folder is None:
         notes = (*notes, "not the map of a run: nothing on associations")
         return Evidence(truth=truth, notes=notes)

@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import torch
@@ -22,32 +23,40 @@ from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.poses import read_poses
 from crowdmap_torch.io.rigs import read_rig
+from crowdmap_torch.ranges import shown
 from crowdmap_torch.tables import Dataset, Journey, Origin, RejectedJourney, Rig
 
 DATASET_FORMAT = "crowdmap-dataset"
 JOURNEY_FORMAT = "crowdmap-journey"
+_MOST_NAMED = 5
+"""Journeys that a message names; of more it says how many."""
 _LONGEST_NAME = 100
 """Characters of a vehicle's name; a longer one is cut and told apart by a number."""
 
 
 def load_dataset(
-    path: Path | str, *, device: torch.device | str = "cpu", strict: bool = False
+    path: Path | str,
+    *,
+    device: torch.device | str = "cpu",
+    strict: bool = False,
+    journeys: Sequence[str] | None = None,
 ) -> Dataset:
     """The journeys of a dataset, in the order of their names, and those set aside with the reason.
 
-    A drive counts once: copies of a journey are set aside, and what was cut out of it. InputError if the dataset
-    itself breaks FORMAT.md, if no journey is left (`NoJourneyLeft`), or, `strict`, if a single one is set aside.
+    `journeys`: only those with these ids, or that match these patterns (`2026-05-*`); None: all. A drive counts once:
+    copies of a journey are set aside, and what was cut out of it. InputError if the dataset itself breaks FORMAT.md, if
+    an id or pattern is that of no journey, if none is left (`NoJourneyLeft`), or, `strict`, if a single one is set aside.
     """
     folder = Path(path)
     if not folder.is_dir():
         raise InputError(f"{folder}: the dataset's folder is missing; expected dataset.json in it")
     with reading(inside=folder):
-        dataset = _load_dataset(folder, strict)
+        dataset = _load_dataset(folder, strict, journeys)
     moved = tuple(_moved(journey, device) for journey in dataset.journeys)
     return replace(dataset, journeys=moved)
 
 
-def _load_dataset(folder: Path, strict: bool) -> Dataset:
+def _load_dataset(folder: Path, strict: bool, wanted: Sequence[str] | None) -> Dataset:
     head = read_json(folder / "dataset.json")
     head.require_format(DATASET_FORMAT)
     origin = read_origin(head)
@@ -55,7 +64,8 @@ def _load_dataset(folder: Path, strict: bool) -> Dataset:
     names: list[tuple[str, ...]] = []
     rejected: list[RejectedJourney] = []
     rigs: dict[str, Rig | InputError] = {}
-    for journey_folder in _journey_folders(folder):
+    folders = _journey_folders(folder)
+    for journey_folder in folders if wanted is None else _named(folders, wanted):
         try:
             journey, type_names = _load_journey(journey_folder, folder / "rigs", rigs)
         except InputError as error:
@@ -140,6 +150,24 @@ def _journey_folders(folder: Path) -> list[Path]:
     if not found:
         raise InputError(f"{journeys}: has no journeys; expected one folder for each journey")
     return sorted(found)
+
+
+def _named(folders: Sequence[Path], wanted: Sequence[str]) -> list[Path]:
+    """Those of the journeys' folders that are named, or that a pattern matches."""
+    chosen: set[Path] = set()
+    for name in wanted:
+        # An id may hold what would be a pattern.
+        own = [p for p in folders if p.name == name]
+        found = own or [p for p in folders if fnmatchcase(p.name, name)]
+        if not found:
+            known = ", ".join(_printable(p.name) for p in folders[:_MOST_NAMED])
+            more = len(folders) - _MOST_NAMED
+            raise InputError(
+                f"{folders[0].parent}: no journey is called {shown(name)}; there are {known}"
+                + (f" and {more} more" if more > 0 else "")
+            )
+        chosen.update(found)
+    return [p for p in folders if p in chosen]
 
 
 def _load_journey(

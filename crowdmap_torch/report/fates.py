@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.io.area import OUTSIDE
 from crowdmap_torch.io.detections import DROPPED_LANE, DROPPED_SIGN
 from crowdmap_torch.lanes import reconstruct
 from crowdmap_torch.mapper import MapResult, trusted_frames
@@ -24,8 +25,10 @@ OUTAGE = "where positions of the journey are off"
 TOO_FEW_JOURNEYS = "in a landmark of too few journeys"
 IMPROBABLE = "in a sign that too many journeys passed by unseen"
 _TRACK = "in a track: "
+_DOOR = "dropped at the door: "
 
 _WHY: dict[str, tuple[str, str]] = {
+    _DOOR + OUTSIDE: ("drives see next to nothing from inside the area", "name a larger one"),
     NO_TRACK: (
         "what is detected in one frame is not found in the next",
         "check that detections carry the number of the frame that they were made in",
@@ -160,7 +163,7 @@ def _dropped(dataset: Dataset, prefix: str) -> Counter[str]:
     for journey in dataset.journeys:
         for reason, count in journey.dropped.items():
             if reason.startswith(prefix):
-                total[f"dropped at the door: {reason.removeprefix(prefix)}"] += count
+                total[_DOOR + reason.removeprefix(prefix)] += count
     return total
 
 

@@ -105,6 +105,23 @@ def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict
     }
 
 
+def counts_line(dataset: Dataset, result: MapResult, config: MapperConfig) -> str:
+    """What the map holds and what it was made of, in a line for people."""
+    counts = counts_of(dataset, result, config)
+
+    def share(kind: str) -> str:
+        used, seen = counts[f"{kind} detections used"], counts[f"{kind} detections"]
+        return f"{used:,} of {seen:,} {kind} detections"
+
+    tentative = counts["tentative signs"]
+    return (
+        f"{counts['signs of the map']:,} signs"
+        + (f" (and {tentative:,} tentative)" if tentative else "")
+        + f", {counts['lanes of the map']:,} lane pieces from {counts['journeys']:,} journeys: "
+        f"{share('sign')}, {share('lane')}"
+    )
+
+
 def pruned_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> tuple[Pruned, ...]:
     """What was left out, by stage and reason; last all detections that are not in the map."""
     totals: Counter[tuple[str, str]] = Counter()

@@ -215,6 +215,7 @@ def inputs_of(
         "configuration": as_dict(config),
         "dataset": {"origin": digest(dataset.origin), "types": digest(dataset.type_names)},
         "journey": {journey.journey_id: digest(journey) for journey in dataset.journeys},
+        **({} if dataset.bbox is None else {"bbox": [*dataset.bbox]}),
         **{name: digest(table) for name, table in beside.items() if table is not None},
     }
 
@@ -240,5 +241,5 @@ def _difference(name: str, before: Any, now: Any) -> str:
         return f"{name} is new"
     if now is None:
         return f"{name} is not there any more"
-    hashed = not name.startswith(("configuration", "crowdmap", "torch", "device"))
+    hashed = not name.startswith(("configuration", "crowdmap", "torch", "device", "bbox"))
     return f"{name} has changed" if hashed else f"{name} was {before}, is {now}"

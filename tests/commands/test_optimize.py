@@ -19,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from worlds.runs import Said, journeys_of
 
 from crowdmap_torch import mapper
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.cli import main
 from crowdmap_torch.commands import optimize as optimize_command
 from crowdmap_torch.config import MapperConfig, load_config
@@ -40,6 +41,18 @@ def run(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run") / "run"
     assert main(["optimize", str(tiny_folder), "--out", str(out), "--workers", "1"]) == 0
     return out
+
+
+@pytest.fixture
+def optimize_only(capsys: pytest.CaptureFixture) -> Callable[..., Said]:
+    """`crowdmap optimize` with these options and no others."""
+
+    def call(*options: str) -> Said:
+        code = main(["optimize", *options])
+        said = capsys.readouterr()
+        return Said(code, said.out, said.err)
+
+    return call
 
 
 @pytest.fixture
@@ -241,6 +254,37 @@ def test_a_wrong_configuration_is_one_line(optimize, tiny_folder: Path, tmp_path
 def test_a_missing_configuration_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):
     said = optimize(tiny_folder, tmp_path / "run", "--config", str(tmp_path / "none.yaml"))
     assert_refused(said, tmp_path / "run", "none.yaml", "the file is missing")
+
+
+def test_the_configuration_is_printed_as_it_would_be_used(optimize_only, tmp_path: Path):
+    config = tmp_path / "some.yaml"
+    config.write_text("method: paper2017\nadjust: {tukey_c: 5.0, lane_height_sigma_m: .inf}\n")
+    for options in ((), ("--config", str(config)), ("--calibration", "off")):
+        said = optimize_only("--print-config", *options)
+        assert (said.code, said.err) == (0, "")
+        again = tmp_path / "again.yaml"
+        again.write_text(said.out)
+        assert optimize_only("--print-config", "--config", str(again)).out == said.out
+    assert load_config(again) == MapperConfig(calibration=CalibrationConfig.off())
+
+
+def test_a_folder_that_is_not_named_is_one_line(optimize_only, tiny_folder: Path):
+    for given, missing in (
+        ((), "DATASET is missing"),
+        ((str(tiny_folder),), "--out RUN is missing"),
+    ):
+        said = optimize_only(*given)
+        assert said.code == 2 and said.err.count("\n") == 1 and missing in said.err
+
+
+def test_a_journey_that_is_not_there_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):
+    said = optimize(tiny_folder, tmp_path / "run", "--journeys", "journey-001,journey-9*")
+    assert_refused(said, tmp_path / "run", "'journey-9*'", "journey-000, journey-001, journey-002")
+
+
+def test_an_area_where_nobody_drove_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):
+    said = optimize(tiny_folder, tmp_path / "run", "--bbox", "9000,0,9100,50")
+    assert_refused(said, tmp_path / "run", "9000,0,9100,50", "no drive comes there", "they are in")
 
 
 def test_an_unknown_device_is_one_line(optimize, tiny_folder: Path, tmp_path: Path):

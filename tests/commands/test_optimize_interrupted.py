@@ -27,6 +27,7 @@ from crowdmap_torch.cli import main
 from crowdmap_torch.commands import optimize as optimize_command
 from crowdmap_torch.config import load_config
 from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.mapper import map_journey
 from crowdmap_torch.runs.folder import RunFolder
 from crowdmap_torch.soak.child import children, ends
 from crowdmap_torch.soak.interrupted import differences
@@ -232,6 +233,44 @@ def test_a_run_does_not_go_on_with_something_else(
     # All before any work, and nothing was touched.
     assert cuts.calls == before
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == files
+
+
+def test_a_part_of_the_dataset_is_mapped_gone_on_with_and_judged_as_a_whole_one(
+    optimize, cuts: Cuts, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # Of the 60 m of street the southern half.
+    out, area = tmp_path / "run", ("--bbox", "-200,-200,200,-60")
+    chosen = ("--journeys", "journey-00[01]")
+    monkeypatch.setattr(mapper, "map_journey", map_journey)
+    cuts.cut = ("adjust_step", 0)
+    with pytest.raises(Interruption):
+        optimize(small, out, *chosen, *area)
+    cuts.cut = None
+    said = optimize(small, out, "--resume", *chosen, "--bbox", "-200,-200,200,-58")
+    assert said.code == 2 and "bbox was [-200.0, -200.0, 200.0, -60.0], is [-200" in said.err
+    said = optimize(small, out, "--resume", *area)
+    assert said.code == 2 and "journey journey-002 is new" in said.err
+
+    said = optimize(small, out, "--resume", *chosen, *area, "-q")
+    assert said.code == 0 and "resuming: 2 of 2 journeys" in said.err and "bundle" not in said.err
+    first, *_, counts, _, _ = said.out.splitlines()
+    assert first.startswith("area -200,-200,200,-60 and 50 m around it: 2 of 2 journeys, ")
+    assert "lane pieces from 2 journeys" in counts
+    provenance = json.loads((out / "map" / "map.json").read_text())["provenance"]
+    assert provenance["bbox"] == [-200, -200, 200, -60]
+    assert provenance["journeys"] == ["journey-000", "journey-001"]
+    left = json.loads((out / "metrics.json").read_text())["area"]
+    assert left["frames_outside"] > 0 and left["journeys_outside"] == 0
+    # `crowdmap evaluate` finds the same figures, and every row of the files has its line.
+    assert main(["evaluate", str(out / "map"), str(small / "survey"), "--json", f"{out}.json"]) == 0
+    again = json.loads(Path(f"{out}.json").read_text())
+    assert again == json.loads((out / "metrics.json").read_text())["survey"]
+    rows = [
+        pq.read_metadata(journey / f"{kind}.parquet").num_rows
+        for journey in journeys_of(small)[:2]
+        for kind in ("signs", "lanes")
+    ]
+    assert pq.read_metadata(out / "associations.parquet").num_rows == sum(rows)
 
 
 def test_a_damaged_stage_is_made_anew(optimize, cuts: Cuts, small: Path, tmp_path: Path, run: Path):

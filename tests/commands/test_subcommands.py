@@ -30,6 +30,14 @@ def test_subcommands_of_subcommands_have_their_full_name():
     assert options.prog == "crowdmap benchmark association"
 
 
+@pytest.mark.parametrize("given", [["--bbox", "-5,-1.5,8,9"], ["--bbox=-5,-1.5,8,9"]])
+def test_a_list_that_begins_below_zero_is_the_value_of_its_option(given: list[str]):
+    parser = argparse.ArgumentParser(prog="crowdmap")
+    add_subcommands(parser, "crowdmap_torch.commands", {"optimize": "map"})
+    options = parser.parse_args(["optimize", "DATA", "--out", "RUN", *given, "-q"])
+    assert options.bbox.sides == (-5, -1.5, 8, 9) and options.quiet
+
+
 def test_an_unknown_name_lists_the_known(
     parser: argparse.ArgumentParser, capsys: pytest.CaptureFixture[str]
 ):

@@ -94,6 +94,19 @@ def test_observable_signs_may_be_named(build, simulated):
     assert figures.signs.recall == 0.5
 
 
+def test_a_map_of_an_area_is_judged_by_what_stands_in_it(build, simulated):
+    true, _, survey, truth = simulated
+    x = true.center_world[:, 0]
+    first = build.hd_map(true[x.argsort()[:1]])
+    cut = replace(first, provenance={"bbox": [float(x.min()) - 1, -50.0, float(x.min()) + 1, 50.0]})
+    for of_truth in (None, truth):
+        whole, part = (evaluate_map(m, survey, truth=of_truth) for m in (first, cut))
+        assert whole.signs.recall < 1 and part.signs.recall == 1
+        assert part.signs.observable == 1
+        assert whole.lanes is not None and part.lanes is not None
+        assert part.lanes.seen_length_m < min(10, whole.lanes.seen_length_m)
+
+
 def test_another_origin_is_refused(build, simulated):
     true, _, survey, _ = simulated
     for origin in (Origin(32.9 + 2e-9, -117.2, 120.0), Origin(32.9, -117.2, 120.002)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,6 +30,34 @@ def test_journeys_come_in_the_order_of_their_names(sound) -> None:
     assert [j.journey_id for j in dataset.journeys] == ["a", "b"]
     assert dataset.rejected == ()
     assert dataset.origin.lat_deg == 32.9
+
+
+@pytest.mark.parametrize(
+    ("wanted", "found"),
+    [
+        (["b"], ["b"]),
+        (["b", "a", "b"], ["a", "b"]),
+        (["[ab]"], ["a", "b"]),
+        (["?", "a"], ["a", "b"]),
+    ],
+)
+def test_journeys_are_chosen_by_id_and_by_pattern(sound, wanted: list[str], found: list[str]):
+    dataset = load_dataset(sound.write(), journeys=wanted)
+    assert [j.journey_id for j in dataset.journeys] == found
+
+
+@pytest.mark.parametrize("name", ["c", "", "x*", "A"])
+def test_a_name_of_no_journey_is_refused_with_those_that_there_are(sound, name: str):
+    folder = sound.write()
+    with pytest.raises(
+        InputError, match=f"no journey is called '{re.escape(name)}'; there are a, b$"
+    ):
+        load_dataset(folder, journeys=["a", name])
+
+
+def test_journeys_that_are_not_asked_for_may_be_bad(sound):
+    sound.journeys["b"].poses["x"][0] = math.nan
+    assert load_dataset(sound.write(), strict=True, journeys=["a"]).rejected == ()
 
 
 def test_types_are_counted_in_one_list_of_the_dataset(sound) -> None:
