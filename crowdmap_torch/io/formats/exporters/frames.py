@@ -15,7 +15,7 @@ from crowdmap_torch.io.formats.exporters.head import head
 from crowdmap_torch.tables import Dataset, HdMap, Rows, Survey
 
 if TYPE_CHECKING:
-    import geopandas as gpd  # pyright: ignore[reportMissingImports]
+    import geopandas as gpd  # pyright: ignore[reportMissingModuleSource]
     import pandas as pd  # pyright: ignore[reportMissingImports]
 
 
@@ -47,8 +47,8 @@ def to_geopandas(what: HdMap | Dataset | Survey) -> dict[str, gpd.GeoDataFrame]:
     InputError where GeoPandas is not installed.
     """
     with needing("to_geopandas", "'crowdmap_torch[gis]'"):
-        import geopandas as gpd  # pyright: ignore[reportMissingImports]
-        import shapely  # pyright: ignore[reportMissingImports]
+        import geopandas as gpd  # pyright: ignore[reportMissingModuleSource]
+        import shapely  # pyright: ignore[reportMissingModuleSource]
 
         from crowdmap_torch.io.formats.exporters.gis_layers import CRS, wkb
     return {
