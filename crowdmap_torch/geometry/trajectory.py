@@ -8,8 +8,11 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import se3
 
-_HALF_WINDOW_S = 0.2
-"""Velocities are differences over about twice this: over single frames the poses' own noise would be most of them."""
+_HALF_WINDOW_S = 1.5
+"""Velocities are those of cubics through the poses up to this far in time: over less the poses' own noise is most of how
+velocities change from frame to frame, and a delay found by them far too small."""
+_BENDING = (0.0, 0.0, 1e-3, 1e-2)
+"""What the coefficients of these cubics count as known to be zero, in frames: few frames make lines, or nothing."""
 
 
 def station(T_world_camera: Float[Tensor, "f 4 4"], *, half_window: int = 7) -> Float[Tensor, " f"]:
@@ -42,13 +45,26 @@ def passes(
 def motion(
     T_world_camera: Float[Tensor, "f 4 4"], t_ns: Int[Tensor, " f"]
 ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-    """Velocity along the world's axes [m/s] and turning about the camera's own [rad/s], of every frame."""
+    """Velocity along the world's axes [m/s] and turning about the camera's own [rad/s], of every frame.
+
+    Those of cubics in time, fitted to the poses around each frame (Savitzky and Golay 1964).
+    """
     T = T_world_camera
-    if not len(T):
-        return T[:, :3, 3], T[:, :3, 3]
+    if len(T) < 2:
+        return torch.zeros_like(T[:, :3, 3]), torch.zeros_like(T[:, :3, 3])
     t_s = (t_ns - t_ns[0]).to(T) * 1e-9
-    low = torch.searchsorted(t_s, t_s - _HALF_WINDOW_S).clamp_max(len(t_s) - 1)
-    high = (torch.searchsorted(t_s, t_s + _HALF_WINDOW_S, right=True) - 1).clamp_min(0)
-    step = (t_s[high] - t_s[low]).clamp_min(1e-3)[:, None]
-    turned = T[low, :3, :3].mT @ T[high, :3, :3]
-    return (T[high, :3, 3] - T[low, :3, 3]) / step, se3.so3_log(turned) / step
+    turned = se3.so3_log(T[:-1, :3, :3].mT @ T[1:, :3, :3]).cumsum(0)
+    moved = torch.cat((T[:, :3, 3], torch.cat((torch.zeros_like(turned[:1]), turned))), dim=1)
+    low = torch.searchsorted(t_s, t_s - _HALF_WINDOW_S)
+    high = torch.searchsorted(t_s, t_s + _HALF_WINDOW_S, right=True)
+    around = low[:, None] + torch.arange(int((high - low).max()), device=low.device)
+    inside = (around < high[:, None]).to(T)
+    around = around.clamp_max(len(T) - 1)
+    ahead = (t_s[around] - t_s[:, None]) / _HALF_WINDOW_S
+    basis = inside[..., None] * torch.stack([ahead**power for power in range(4)], dim=-1)
+    normal = basis.mT @ basis + torch.diag(T.new_tensor(_BENDING))
+    # A frame that nothing is near to stands still, for all that is known.
+    normal[:, 1, 1] += 1e-9
+    slope = torch.linalg.solve(normal, basis.mT @ (moved[around] - moved[:, None]))[:, 1]
+    velocity, turning = (slope / _HALF_WINDOW_S).split(3, dim=1)
+    return velocity, turning

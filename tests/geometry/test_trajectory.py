@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.geometry.trajectory import passes, station
+from crowdmap_torch.geometry.trajectory import motion, passes, station
 
 F64 = torch.float64
 
@@ -72,3 +72,41 @@ def test_a_car_that_stands_does_not_come_back():
     place[100:, 0] = 99
     assert passes(at(place)) == [slice(0, 300)]
     assert passes(at(place[:1])) == [slice(0, 1)]
+
+
+def times(seconds: Tensor) -> Tensor:
+    return (seconds * 1e9).long()
+
+
+def test_motion_is_that_of_a_smooth_drive_whenever_its_pictures_are_taken(generator):
+    t = torch.rand(200, dtype=F64, generator=generator).sort().values * 8
+    place = torch.stack((10 * t + t**2 / 2, 2 * t - t**3 / 30, 0.1 * t), dim=-1)
+    heading = torch.zeros_like(place)
+    heading[:, 1] = 0.3 * t - 0.02 * t**2
+    velocity, turning = motion(se3.make(se3.so3_exp(heading), place), times(t))
+    expected = torch.stack((10 + t, 2 - t**2 / 10, torch.full_like(t, 0.1)), dim=-1)
+    torch.testing.assert_close(velocity, expected, rtol=0, atol=0.1)
+    # At the ends cubics are held back a little: there they know one side only.
+    torch.testing.assert_close(velocity[40:-40], expected[40:-40], rtol=0, atol=5e-3)
+    torch.testing.assert_close(turning[:, 1], 0.3 - 0.04 * t, rtol=0, atol=2e-3)
+
+
+def test_noise_of_poses_is_little_of_their_motion(generator):
+    # What a delay is found by: were velocities noisy, it would be found too small by as much.
+    t = torch.arange(450, dtype=F64) / 15
+    place = torch.stack((12 * t, torch.zeros_like(t), torch.zeros_like(t)), dim=-1)
+    noise = 0.05 * torch.randn(450, 3, dtype=F64, generator=generator)
+    velocity, _ = motion(se3.make(se3.so3_exp(0 * place), place + noise), times(t))
+    off = (velocity - torch.tensor([12.0, 0.0, 0.0], dtype=F64))[25:-25]
+    assert float(off.std()) < 0.03
+
+
+def test_motion_over_gaps_and_of_few_frames():
+    t = torch.tensor([0.0, 0.1, 0.2, 60.0, 60.1, 60.2], dtype=F64)
+    place = torch.stack((10 * t, 0 * t, 0 * t), dim=-1)
+    place[3:, 0] -= 400.0
+    velocity, _ = motion(se3.make(se3.so3_exp(0 * place), place), times(t))
+    torch.testing.assert_close(velocity[:, 0], torch.full((6,), 10.0, dtype=F64), rtol=0, atol=0.05)
+    for frames in (0, 1):
+        T = se3.make(se3.so3_exp(0 * place[:frames]), place[:frames])
+        assert [part.shape for part in motion(T, times(t[:frames]))] == [(frames, 3), (frames, 3)]
