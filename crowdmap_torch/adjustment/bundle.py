@@ -147,6 +147,7 @@ class Bundle(nn.Module):
             ByOptics.none(len(rows), self.fleet.config, rows.px, heights)
             for rows, heights in ((self.corners, 0), (self.lane_points, 1))
         )
+        self._by_mount = self.fleet.by_mount(values["pose"])
         self._detections = (self.corners.detection, corner_detections(self.corners))
         self._plan = self._elimination()
 
@@ -241,7 +242,9 @@ class Bundle(nn.Module):
     def _rescale_noise(self, values: dict[str, Tensor], evidence: PoseEvidence) -> bool:
         """Finds the noise of poses from frame to frame; returns whether it has come to rest."""
         terms = self.prior.terms(self.prior_scale, self.white_scale)
-        residual = whitened_residuals(self.fleet.of_poses(terms["pose_white"]), values)
+        residual = whitened_residuals(
+            self.fleet.of_poses(terms["pose_white"], self._by_mount), values
+        )
         found = white_scales(
             self.prior, residual, evidence.left, self.prior_scale, self.white_scale
         )
@@ -254,6 +257,7 @@ class Bundle(nn.Module):
         """Takes every lens as it is where the unknowns, and the splines' matches, have the points by now."""
         values, rows = self.values(), self.corners
         by_corner, by_point = self._by_optics
+        self._by_mount = self.fleet.by_mount(values["pose"])
         if len(rows):
             sign = values["sign"][rows.sign]
             corner = torch.nn.functional.pad(rows.template * values["size"][rows.sign], (0, 1))
@@ -354,7 +358,7 @@ class Bundle(nn.Module):
             **self.fleet.priors(),
             **self.fixed,
         }
-        terms["pose_white"] = self.fleet.of_poses(terms["pose_white"])
+        terms["pose_white"] = self.fleet.of_poses(terms["pose_white"], self._by_mount)
         terms.update(size_class_term(self.values()["size"], self.config))
         terms.update(self._corner_term(self.corner_sigma()))
         terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))

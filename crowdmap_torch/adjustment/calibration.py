@@ -10,16 +10,23 @@ the positioning module's word is compared with; the others move what the image s
 with the derivatives taken where the unknowns are by now, as with lenses (`lenses`): residuals are those of the true camera.
 What is left out is how the calibration changes the derivatives by poses and landmarks: some thousandths of them. Unknowns
 are in units of their prior sigmas. A car is a `vehicle_id`, or else a rig.
+
+Cars that run the same programs err alike: of the prior's variance of clocks, read-outs and detectors they have a share
+in common, x_c = m + d_c with m ~ N(0, share) and d_c ~ N(0, 1 - share). With m marginalised, that of V cars is one row
+for each and one for each pair of them,
+
+    sum_c x_c^2 / (1 - share + V share) + sum_c<d (x_c - x_d)^2 / s^2
+    V / s^2 = 1 / (1 - share) - 1 / (1 - share + V share)
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
@@ -36,6 +43,8 @@ from crowdmap_torch.tables import Journey
 
 _SUREST = 1e-3
 """Least share of the configuration's sigma that what was found before counts with."""
+_LEAST_APART = 1e-6
+"""Share of the variance that cars have to themselves where all of it is said to be common."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +71,14 @@ class CalibrationConfig(Settings):
     """How far to the left of a marker's middle, as the driver sees it, its points are detected."""
     height_m: LengthOrNone = 0.03
     """Height of the camera above the road against the stated one."""
+    in_common: Share = 0.3
+    """Share of the variances of clocks, read-outs and detectors' habits that all cars have in common."""
 
     @classmethod
     def off(cls) -> CalibrationConfig:
         """Everything is known."""
-        return cls(**{f.name: 0.0 for f in fields(cls)})
+        every = (one.name for kind in VARIABLES.values() for one in kind)
+        return cls(**dict.fromkeys(every, 0.0))
 
 
 @dataclass(frozen=True)
@@ -79,17 +91,23 @@ class Parameter:
     """How many numbers it is."""
     unit: float = 1.0
     """Of the configuration's number, in those of this package."""
+    alike: bool = False
+    """Whether cars of one make have some of it in common: programs are the same in all of them, mounts and lenses not."""
 
 
-MOUNT = (Parameter("mount_deg", 3, math.pi / 180), Parameter("mount_m", 3), Parameter("clock_s", 1))
+MOUNT = (
+    Parameter("mount_deg", 3, math.pi / 180),
+    Parameter("mount_m", 3),
+    Parameter("clock_s", 1, alike=True),
+)
 """What moves the pose."""
 OPTICS = (
     Parameter("focal", 1),
     Parameter("principal_px", 2),
-    Parameter("read_out_s", 1),
-    Parameter("box", 1),
-    Parameter("corner_px", 2),
-    Parameter("lane_m", 1),
+    Parameter("read_out_s", 1, alike=True),
+    Parameter("box", 1, alike=True),
+    Parameter("corner_px", 2, alike=True),
+    Parameter("lane_m", 1, alike=True),
     Parameter("height_m", 1),
 )
 """What moves the image, and the road under it."""
@@ -105,6 +123,12 @@ def columns(variable: str, config: CalibrationConfig) -> dict[str, slice]:
             found[one.name] = slice(first, first + one.count)
             first += one.count
     return found
+
+
+def alike(variable: str, config: CalibrationConfig) -> Bool[Tensor, " k"]:
+    """Which of a car's unknown numbers are as those of other cars."""
+    unknown = (one for one in VARIABLES[variable] if getattr(config, one.name) > 0)
+    return torch.tensor([one.alike for one in unknown for _ in range(one.count)])
 
 
 def width(variable: str, config: CalibrationConfig) -> int:
@@ -137,8 +161,6 @@ class Fleet:
     """Car of each journey."""
     of_pose: Int[Tensor, " p"]
     """Car of each pose of the bundle."""
-    given: Float[Tensor, "p 4 4"]
-    """The positioning module's poses."""
     velocity: Float[Tensor, "p 3"]
     """Of the camera, along the world's axes [m/s]."""
     turning: Float[Tensor, "p 3"]
@@ -147,6 +169,8 @@ class Fleet:
     """What is known of every car before, by variable: zero, or what was found earlier."""
     prior_sigma: dict[str, Float[Tensor, "v _"]]
     """1-sigma of that."""
+    found_before: dict[str, Bool[Tensor, "v _"]]
+    """What was found earlier: it has nothing in common with other cars that is not in it already."""
     config: CalibrationConfig
 
     @property
@@ -155,24 +179,35 @@ class Fleet:
         return tuple(self.expected)
 
     def priors(self) -> dict[str, CostTerm]:
-        """Calibrations are about as stated, or as found before."""
-        every = torch.arange(len(self.vehicles), device=self.given.device)
-        return {
-            f"{name}_prior": CostTerm(
+        """Calibrations are about as stated, or as found before, and about as those of the other cars."""
+        every = torch.arange(len(self.vehicles), device=self.velocity.device)
+        first, second = torch.combinations(every).unbind(1)
+        terms = {}
+        for name in self.variables:
+            together = ~self.found_before[name] & alike(name, self.config).to(every.device)
+            alone, apart = _of_cars(together.sum(0).to(self.velocity), self.config.in_common)
+            sigma = torch.where(together, alone, self.prior_sigma[name])
+            terms[f"{name}_prior"] = CostTerm(
                 gauss_markov_start,
                 ((name, every),),
                 (self.expected[name],),
-                1 / self.prior_sigma[name],
+                1 / sigma,
                 takes_rows=True,
             )
-            for name in self.variables
-        }
+            if len(first):
+                terms[f"{name}_alike"] = CostTerm(
+                    gauss_markov_start,
+                    ((name, first), (name, second)),
+                    weight=apart * (together[first] & together[second]),
+                    takes_rows=True,
+                )
+        return terms
 
-    def of_poses(self, term: CostTerm) -> CostTerm:
-        """`pose_white`, of the pose that a true mount and clock would have given."""
+    def of_poses(self, term: CostTerm, by: Float[Tensor, "p 6 k"]) -> CostTerm:
+        """`pose_white`, of the pose that a true mount and clock would give; `by` is `by_mount` of the poses."""
         if "mount" not in self.variables:
             return term
-        return with_linear_part(term, "mount", self.of_pose, -self._by_mount())
+        return with_linear_part(term, "mount", self.of_pose, -by)
 
     def of_corners(self, term: CostTerm, rows: CornerObservations, by: ByOptics) -> CostTerm:
         """`sign_reprojection` by the true camera; `by` are `by_optics` of the corners."""
@@ -198,15 +233,19 @@ class Fleet:
             "lane_height": with_linear_part(ground, "optics", car, by.height),
         }
 
-    def _by_mount(self) -> Float[Tensor, "p 6 k"]:
-        """Derivatives of what the poses given are wrong by, as tangents of geometry.se3."""
+    def by_mount(self, pose: Float[Tensor, "p 4 4"]) -> Float[Tensor, "p 6 k"]:
+        """Derivatives of what the poses given are wrong by, as tangents of geometry.se3, where the poses are `pose`.
+
+        A lever arm points to where the camera is, not to where a pose that is given with noise has it: that noise is
+        in what is compared with it as well, and thousands of frames would take the one for the other.
+        """
         config, at = self.config, columns("mount", self.config)
-        by = self.given.new_zeros(len(self.given), 6, width("mount", config))
+        by = pose.new_zeros(len(pose), 6, width("mount", config))
         if "mount_deg" in at:
             eye = torch.eye(3).to(by)
             by[:, 3:, at["mount_deg"]] = eye * math.radians(config.mount_deg)
         if "mount_m" in at:
-            by[:, :3, at["mount_m"]] = self.given[:, :3, :3] * config.mount_m
+            by[:, :3, at["mount_m"]] = pose[:, :3, :3] * config.mount_m
         if "clock_s" in at:
             moved = torch.cat((self.velocity, self.turning), dim=-1)
             by[:, :, at["clock_s"]] = moved[..., None] * config.clock_s
@@ -296,21 +335,33 @@ def fleet_of(
         torch.cat(part)[frame]
         for part in zip(*(motion(one.T_world_camera, one.t_ns) for one in journeys), strict=True)
     )
-    given = torch.cat([one.T_world_camera for one in journeys])[frame]
-    expected, sigma = {}, {}
+    expected, sigma, found_before = {}, {}, {}
     for variable in VARIABLES:
         if count := width(variable, config):
-            expected[variable] = given.new_zeros(len(vehicles), count)
+            expected[variable] = velocity.new_zeros(len(vehicles), count)
             sigma[variable] = torch.ones_like(expected[variable])
+            found_before[variable] = torch.zeros_like(expected[variable], dtype=torch.bool)
             for name, at in columns(variable, config).items():
                 for car in vehicles:
                     if found := known.get(car, {}).get(name):
-                        of_number = given.new_tensor(found) / getattr(config, name)
+                        of_number = velocity.new_tensor(found) / getattr(config, name)
                         expected[variable][number[car], at] = of_number[0]
+                        found_before[variable][number[car], at] = True
                         # What was found is not surer than before because it is asked for again.
                         sigma[variable][number[car], at] = of_number[1].clamp(_SUREST, 1.0)
     cars = of_journey[journey]
-    return Fleet(vehicles, of_journey, cars, given, velocity, turning, expected, sigma, config)
+    return Fleet(
+        vehicles, of_journey, cars, velocity, turning, expected, sigma, found_before, config
+    )
+
+
+def _of_cars(
+    count: Float[Tensor, " k"], in_common: float
+) -> tuple[Float[Tensor, " k"], Float[Tensor, " k"]]:
+    """1-sigma of each car's row and weight of each pair's, by number, where so many cars have something in common."""
+    apart = max(1 - in_common, _LEAST_APART)
+    alone = apart + count * in_common
+    return alone.sqrt(), ((1 / apart - 1 / alone) / count.clamp_min(1)).sqrt()
 
 
 def _means(value: Float[Tensor, "m 2"], group: Int[Tensor, " m"]) -> Float[Tensor, "m 2"]:

@@ -13,12 +13,13 @@ from torch import Tensor
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
-from crowdmap_torch.adjustment.calibration import CalibrationConfig, columns
+from crowdmap_torch.adjustment.calibration import CalibrationConfig, Fleet, columns, fleet_of
 from crowdmap_torch.adjustment.found_calibration import FleetCalibration
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import camera, se3
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.linearize import residuals
 from crowdmap_torch.simulate.dataset import SimulationConfig, write_dataset
 from crowdmap_torch.simulate.fleet import FleetConfig
@@ -114,6 +115,64 @@ def test_all_known_is_the_adjustment_without(tiny: Dataset, tiny_result: MapResu
     bundle = bundle_of(tiny, tiny_result, off)
     assert bundle.fleet.variables == () and not {"mount", "optics"} & set(bundle.values())
     assert not any("prior" in name for name in bundle.problem().terms if "mount" in name)
+
+
+def fleet_of_cars(
+    dataset: Dataset, config: CalibrationConfig, known: dict[str, KnownCalibration]
+) -> Fleet:
+    """Of four cars, a to d, that drove once each."""
+    journey = dataset.journeys[0]
+    cars = [replace(journey, vehicle_id=name) for name in "abcd"]
+    first = torch.arange(4) * len(journey.t_ns)
+    return fleet_of(cars, first, torch.arange(4), config, known)
+
+
+def covariance_before(fleet: Fleet, variable: str) -> Tensor:
+    """Of all cars' numbers [v, k, v, k], by the rows that are known of them before anything is seen."""
+    terms = [term for name, term in fleet.priors().items() if name.startswith(variable)]
+
+    def cost(x: Tensor) -> Tensor:
+        return sum(residuals(term, {variable: x}).square().sum() / 2 for term in terms)  # type: ignore[return-value]
+
+    x = fleet.expected[variable]
+    hessian = torch.autograd.functional.hessian(cost, x)
+    assert isinstance(hessian, Tensor)
+    return torch.linalg.inv(hessian.reshape(x.numel(), -1)).view(hessian.shape)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 1.0])
+def test_cars_have_a_share_of_their_programs_errors_in_common(tiny: Dataset, share: float) -> None:
+    config = CalibrationConfig(in_common=share)
+    fleet = fleet_of_cars(tiny, config, {})
+    found = covariance_before(fleet, "optics")
+    for name, at in columns("optics", config).items():
+        expected = torch.eye(4, dtype=F64)
+        if name in ("read_out_s", "box", "corner_px", "lane_m"):
+            expected = share + (1 - share) * expected
+        for number in range(at.start, at.stop):
+            of_number = found[:, number, :, number]
+            torch.testing.assert_close(of_number, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_what_was_found_of_a_car_has_nothing_in_common_with_the_others(tiny: Dataset) -> None:
+    config = CalibrationConfig(in_common=0.5)
+    box = columns("optics", config)["box"].start
+    fleet = fleet_of_cars(tiny, config, {"b": {"box": ((0.01,), (0.001,))}})
+    found = covariance_before(fleet, "optics")[:, box, :, box]
+    expected = 0.5 + 0.5 * torch.eye(4, dtype=F64)
+    expected[1], expected[:, 1] = 0, 0
+    expected[1, 1] = 0.1**2
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_a_lever_arm_turns_with_the_camera_where_it_is_now(tiny: Dataset) -> None:
+    fleet = fleet_of_cars(tiny, CalibrationConfig(), {})
+    pose = tiny.journeys[0].T_world_camera[:4]
+    turned = pose.clone()
+    turned[:, :3, :3] = pose[:, :3, :3] @ se3.so3_exp(torch.tensor([0.0, 0.02, 0.0], dtype=F64))
+    place = columns("mount", fleet.config)["mount_m"]
+    by = fleet.by_mount(turned)[:, :3, place]
+    torch.testing.assert_close(by, turned[:, :3, :3] * fleet.config.mount_m)
 
 
 @pytest.fixture(scope="module")
