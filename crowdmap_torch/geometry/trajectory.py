@@ -13,6 +13,8 @@ _HALF_WINDOW_S = 1.5
 velocities change from frame to frame, and a delay found by them far too small."""
 _BENDING = (0.0, 0.0, 1e-3, 1e-2)
 """What the coefficients of these cubics count as known to be zero, in frames: few frames make lines, or nothing."""
+_AT_ONCE = 2**18
+"""Poses around frames that are looked at together, all frames counted: a long drive takes no more memory."""
 
 
 def station(T_world_camera: Float[Tensor, "f 4 4"], *, half_window: int = 7) -> Float[Tensor, " f"]:
@@ -57,14 +59,28 @@ def motion(
     moved = torch.cat((T[:, :3, 3], torch.cat((torch.zeros_like(turned[:1]), turned))), dim=1)
     low = torch.searchsorted(t_s, t_s - _HALF_WINDOW_S)
     high = torch.searchsorted(t_s, t_s + _HALF_WINDOW_S, right=True)
+    most = max(int((high - low).max()), 1)
+    every = torch.arange(len(T), device=low.device)
+    slopes = [_slope(t_s, moved, at, low[at], high[at]) for at in every.split(_AT_ONCE // most + 1)]
+    velocity, turning = torch.cat(slopes).split(3, dim=1)
+    return velocity, turning
+
+
+def _slope(
+    t_s: Float[Tensor, " f"],
+    moved: Float[Tensor, "f k"],
+    at: Int[Tensor, " n"],
+    low: Int[Tensor, " n"],
+    high: Int[Tensor, " n"],
+) -> Float[Tensor, "n k"]:
+    """Derivatives at some frames `at` of the cubics through what lies from `low` up to `high` [1/s]."""
     around = low[:, None] + torch.arange(int((high - low).max()), device=low.device)
-    inside = (around < high[:, None]).to(T)
-    around = around.clamp_max(len(T) - 1)
-    ahead = (t_s[around] - t_s[:, None]) / _HALF_WINDOW_S
+    inside = (around < high[:, None]).to(moved)
+    around = around.clamp_max(len(moved) - 1)
+    ahead = (t_s[around] - t_s[at, None]) / _HALF_WINDOW_S
     basis = inside[..., None] * torch.stack([ahead**power for power in range(4)], dim=-1)
-    normal = basis.mT @ basis + torch.diag(T.new_tensor(_BENDING))
+    normal = basis.mT @ basis + torch.diag(moved.new_tensor(_BENDING))
     # A frame that nothing is near to stands still, for all that is known.
     normal[:, 1, 1] += 1e-9
-    slope = torch.linalg.solve(normal, basis.mT @ (moved[around] - moved[:, None]))[:, 1]
-    velocity, turning = (slope / _HALF_WINDOW_S).split(3, dim=1)
-    return velocity, turning
+    right_side = basis.mT @ (moved[around] - moved[at, None])
+    return torch.linalg.solve(normal, right_side)[:, 1] / _HALF_WINDOW_S

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry import se3, trajectory
 from crowdmap_torch.geometry.trajectory import motion, passes, station
 
 F64 = torch.float64
@@ -99,6 +99,15 @@ def test_noise_of_poses_is_little_of_their_motion(generator):
     velocity, _ = motion(se3.make(se3.so3_exp(0 * place), place + noise), times(t))
     off = (velocity - torch.tensor([12.0, 0.0, 0.0], dtype=F64))[25:-25]
     assert float(off.std()) < 0.03
+
+
+def test_motion_of_a_long_drive_is_found_in_pieces(generator, monkeypatch):
+    t = torch.arange(100, dtype=F64) / 10
+    T = at(torch.randn(100, 3, dtype=F64, generator=generator).cumsum(0))
+    whole = motion(T, times(t))
+    monkeypatch.setattr(trajectory, "_AT_ONCE", 200)
+    for part, of_whole in zip(motion(T, times(t)), whole, strict=True):
+        torch.testing.assert_close(part, of_whole)
 
 
 def test_motion_over_gaps_and_of_few_frames():
