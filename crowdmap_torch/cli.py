@@ -24,6 +24,7 @@ COMMANDS = {
     "convert": "bring drives in other formats into a dataset",
     "evaluate": "compare a map with a survey",
     "export": "write a map in a format of others",
+    "view": "write a page to walk around in a map, a run or a data set",
     "calibrate": "calibrate the road of a rig from surveyed points",
     "study": "draw the paper's figures, ours beside them",
     "benchmark": "measure speed and accuracy beside other software",

@@ -26,7 +26,7 @@ FLOORS = (
     ("tracking", "road", "signs", "lanes", "crowd_signs", "crowd_lanes", "survey"),
     ("io",),
     ("evaluation", "simulate"),
-    ("adjustment",),
+    ("adjustment", "viewer"),
     ("config", "plausibility"),
     ("mapper", "single_journey"),
     ("report",),

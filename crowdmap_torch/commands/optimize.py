@@ -161,7 +161,7 @@ def _map(
     findings = _looked_over(options.dataset, dataset, config)
 
     progress = Progress(io.StringIO() if options.quiet else None)
-    folder.prepare()
+    folder.prepare(options.dataset)
     kept.begin()
     with TensorBoardLog(folder.tensorboard) as log:
         log.log_config(dump(config))

@@ -57,6 +57,14 @@ class Document:
         name = f"{self.section}.{key}" if self.section else key
         return Document(self.path, self.take(key), name)
 
+    def parts(self, key: str) -> list[Document]:
+        """A list of mappings inside this one."""
+        values = self.take(key)
+        if not isinstance(values, list):
+            raise self.fault(f"expected a list, found {_kind(values)}", key)
+        name = f"{self.section}.{key}" if self.section else key
+        return [Document(self.path, value, f"{name}[{k}]") for k, value in enumerate(values)]
+
     def text(self, key: str) -> str:
         """A string that is not empty."""
         value = self.take(key)

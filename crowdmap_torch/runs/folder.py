@@ -107,10 +107,11 @@ class RunFolder:
                 with suppress(OSError):
                     folder.rmdir()
 
-    def prepare(self) -> None:
-        """Begins a run; without `resume` what an interrupted one has left goes."""
+    def prepare(self, dataset: Path | None = None) -> None:
+        """Begins a run of a data set, whose place is kept; without `resume` what an interrupted one has left goes."""
         self._is_begun = True
-        write_json(self.path / "run.json", {"format": _FORMAT, "version": 1})
+        place = {} if dataset is None else {"dataset": _way(self.path, dataset)}
+        write_json(self.path / "run.json", {"format": _FORMAT, "version": 1, **place})
         if self.resume:
             # A run that was killed could clear nothing away; its finished stages alone are gone on from.
             self._drop_result()
@@ -289,6 +290,11 @@ class RunFolder:
             write_signs(place / "signs.parquet", made.signs, signs, dataset.type_names)
             lanes = [f"{journey.journey_id}-l{i}" for i in range(len(made.lanes))]
             write_lanes(place / "lanes.parquet", made.lanes, lanes)
+
+
+def _way(run: Path, dataset: Path) -> str:
+    """The data set as seen from the run, so that both can be moved together."""
+    return os.path.relpath(dataset.resolve(), run.resolve())
 
 
 def _is_run(path: Path) -> bool:
