@@ -1,5 +1,7 @@
 """Writes a simulated dataset with exact ground truth: `crowdmap simulate OUT --world suburb --seed 0`.
 
+`--map` takes a map for the world: a map's or survey's folder, a file of Lanelet2 (.osm) or OpenDRIVE (.xodr), or a
+dataset, whose survey is driven along with its own poses and rigs.
 Every number of the presets is an option; `--help` lists them with their meaning.
 """
 
@@ -14,20 +16,27 @@ import typing
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.errors import input_read
+from crowdmap_torch.io.formats.composing.map_files import map_of_file
+from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.ranges import Count, Factor, Seed, argument, hints
 from crowdmap_torch.simulate.dataset import DETECTION_PRESETS, SimulationConfig, write_dataset
 from crowdmap_torch.simulate.errors import ALL, ERRORS, with_errors
 from crowdmap_torch.simulate.faults import KINDS
 from crowdmap_torch.simulate.fleet import FleetConfig
 from crowdmap_torch.simulate.lane_perception import LaneDetectionConfig
+from crowdmap_torch.simulate.map_worlds import map_world
 from crowdmap_torch.simulate.positioning import POSITIONING_PRESETS, PositioningConfig
+from crowdmap_torch.simulate.recordings import Recording, recordings
 from crowdmap_torch.simulate.rigs import RigConfig
 from crowdmap_torch.simulate.roads import RoadShape
 from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
 from crowdmap_torch.simulate.signposts import SignConfig
 from crowdmap_torch.simulate.vehicle import VehicleConfig
-from crowdmap_torch.simulate.worlds import WORLD_PRESETS, WorldConfig
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, World, WorldConfig
 
 _GROUPS = {
     "world": WorldConfig,
@@ -46,6 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap simulate` takes."""
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the dataset")
     parser.add_argument("--world", choices=sorted(WORLD_PRESETS), default="suburb")
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="MAP",
+        help="the world is a map: a folder, a .osm or .xodr file, or a dataset with a survey, whose poses are driven again",
+    )
     parser.add_argument("--journeys", type=argument(Count), default=25)
     parser.add_argument("--seed", type=argument(Seed), default=0)
     parser.add_argument(
@@ -94,12 +109,35 @@ def run(options: argparse.Namespace) -> None:
     with input_read():
         config = _configuration(options)
         begun = time.perf_counter()
+        world = None if options.map is None else _map_world(options.map, config)
         built = write_dataset(
-            config, options.out, overwrite=options.overwrite, on_journey=_progress(options.journeys)
+            config,
+            options.out,
+            world=world,
+            overwrite=options.overwrite,
+            on_journey=_progress(options.journeys),
         )
     print(
         f"{options.out}: {options.journeys} journeys, {len(built.signs)} signs, "
         f"{len(built.markers)} lane markers in {time.perf_counter() - begun:.1f} s"
+    )
+
+
+def _map_world(path: Path, config: SimulationConfig) -> World:
+    """The world that a map is, with drives if it is the survey of a dataset."""
+    rng = np.random.default_rng([config.seed if config.world_seed is None else config.world_seed])
+    drives: tuple[Recording, ...] = ()
+    if (path / "dataset.json").is_file():
+        drives = recordings(load_dataset(path).journeys)
+        path = path / "survey"
+    hd_map = map_of_file(path) if path.is_file() else read_map(path)
+    return map_world(
+        hd_map,
+        config.world.signs,
+        rng,
+        recordings=drives,
+        dash_m=config.world.dash_m,
+        gap_m=config.world.gap_m,
     )
 
 

@@ -17,6 +17,7 @@ from crowdmap_torch.simulate import faults, files, lane_perception, sign_detecti
 from crowdmap_torch.simulate.fleet import FleetConfig, Vehicle, build_vehicle
 from crowdmap_torch.simulate.lane_perception import LaneDetectionConfig, LaneRows, detect_lanes
 from crowdmap_torch.simulate.motion import Motion
+from crowdmap_torch.simulate.passing import passing
 from crowdmap_torch.simulate.positioning import (
     DriveErrors,
     PositioningConfig,
@@ -25,6 +26,7 @@ from crowdmap_torch.simulate.positioning import (
     pose_errors,
     reported_sigmas,
 )
+from crowdmap_torch.simulate.recorded import drive_again
 from crowdmap_torch.simulate.rigs import RigConfig, SimulatedRig, build_rig
 from crowdmap_torch.simulate.sign_detections import SignDetectionConfig, SignRows
 from crowdmap_torch.simulate.sign_perception import detect_signs
@@ -91,9 +93,9 @@ def make_rigs(config: SimulationConfig) -> tuple[SimulatedRig, ...]:
     )
 
 
-def make_fleet(config: SimulationConfig) -> tuple[Vehicle, ...]:
-    """The vehicles that drive the journeys in turn."""
-    rigs = make_rigs(config)
+def make_fleet(config: SimulationConfig, world: World | None = None) -> tuple[Vehicle, ...]:
+    """The vehicles that drive the journeys in turn, with the rigs of a world's recordings if it has some."""
+    rigs = _rigs(config, world)
     fleet = []
     for index in range(config.fleet.vehicles or len(rigs)):
         number = index % len(rigs)
@@ -108,6 +110,12 @@ def make_fleet(config: SimulationConfig) -> tuple[Vehicle, ...]:
             )
         )
     return tuple(fleet)
+
+
+def _rigs(config: SimulationConfig, world: World | None) -> tuple[SimulatedRig, ...]:
+    if world is None or not world.recordings:
+        return make_rigs(config)
+    return tuple({recording.rig.rig_id: recording.rig for recording in world.recordings}.values())
 
 
 def make_journey(
@@ -126,8 +134,7 @@ def make_journey(
     if config.world.both_directions:
         direction = 1 if index % 2 == 0 else -1
         vehicle = fleet[index // 2 % len(fleet)]
-    rig = vehicle.true_rig
-    drive = drive_through(world, rig, config.vehicle, drive_rng, direction=direction)
+    drive = _drive(config, world, vehicle, index, drive_rng, direction=direction)
     wrong = drive_errors(
         drive.distance, config.positioning, np.random.default_rng([config.seed, _DRIVE, index])
     )
@@ -135,7 +142,8 @@ def make_journey(
     if wrong.outage is not None:
         error = replace(error, translation=error.translation + wrong.outage.shift(drive.distance))
     T_reported = measured_poses(_stamped_poses(drive, vehicle), error)
-    seen_from, camera = faults.with_sensor_fault(drive, rig.camera, fault, fault_rng)
+    true_camera = vehicle.true_rig.camera
+    seen_from, camera = faults.with_sensor_fault(drive, true_camera, fault, fault_rng)
     claimed = faults.with_upload_fault(world.signs, fault, fault_rng)
     rate = config.vehicle.frame_rate_hz
     return SimulatedJourney(
@@ -168,20 +176,49 @@ def make_journey(
     )
 
 
+def _drive(
+    config: SimulationConfig,
+    world: World,
+    vehicle: Vehicle,
+    index: int,
+    rng: np.random.Generator,
+    *,
+    direction: int,
+) -> Drive:
+    """The truth of the `index`-th journey: along the road, or as one of the vehicle's rig was driven before."""
+    rig = vehicle.true_rig
+    if world.recordings:
+        own = [r for r in world.recordings if r.rig.rig_id == vehicle.rig.rig_id]
+        drive = drive_again(
+            own[index % len(own)], vehicle.rig, rig, world.road, config.vehicle, rng
+        )
+    else:
+        drive = drive_through(world, rig, config.vehicle, rng, direction=direction)
+    if not world.is_map:
+        return drive
+    ahead = drive.R_world_camera[:, :, 2]
+    return replace(drive, passing=passing(world.markers, drive.p_world_camera, ahead))
+
+
 def write_dataset(
     config: SimulationConfig,
     out: Path,
     *,
+    world: World | None = None,
     overwrite: bool = False,
     on_journey: Callable[[int], None] = lambda _: None,
 ) -> World:
-    """Simulates and writes a dataset with its survey; `on_journey` is called after each journey."""
+    """Simulates and writes a dataset with its survey, in the configuration's world or a given one.
+
+    `on_journey` is called after each journey.
+    """
     if out.exists():
         if not overwrite:
             raise ValueError(f"{out} exists already; choose another folder or pass --overwrite")
         if not out.is_dir() or (any(out.iterdir()) and not (out / "dataset.json").exists()):
             raise ValueError(f"{out} is no dataset (it has no dataset.json); it is left alone")
-    world, fleet = make_world(config), make_fleet(config)
+    world = make_world(config) if world is None else world
+    fleet = make_fleet(config, world)
     drives = {}
     rng = np.random.default_rng([config.seed, _FAULTS])
     fault_of = faults.spread_faults(config.bad_drives, config.journeys, rng)
@@ -189,9 +226,9 @@ def write_dataset(
     with atomic_folder(out) as folder:
         write_json(
             folder / "dataset.json",
-            {"format": "crowdmap-dataset", "version": 1, "origin": files.ORIGIN},
+            {"format": "crowdmap-dataset", "version": 1, "origin": asdict(world.origin)},
         )
-        for rig in make_rigs(config):
+        for rig in _rigs(config, world):
             files.write_rig(folder / "rigs" / rig.rig_id, rig)
         for index in range(config.journeys):
             journey = make_journey(config, world, fleet, index, fault_of[index])
@@ -234,7 +271,7 @@ def _write_journey(
         started_ns,
         reported_sigmas(config.positioning, journey.errors),
     )
-    files.write_sign_rows(folder / "signs.parquet", journey.signs, journey.drive)
+    files.write_sign_rows(folder / "signs.parquet", journey.signs, journey.drive, world)
     files.write_lane_rows(folder / "lanes.parquet", journey.lanes, journey.drive)
     files.write_truth(
         out / "survey" / "truth" / journey.journey_id,

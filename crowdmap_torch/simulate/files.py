@@ -24,7 +24,6 @@ from crowdmap_torch.simulate.sign_detections import SignRows, all_codes
 from crowdmap_torch.simulate.vehicle import Drive
 from crowdmap_torch.simulate.worlds import World
 
-ORIGIN = {"lat_deg": 32.9, "lon_deg": -117.2, "height_m": 120.0}
 _CORNERS = polygon.CORNER_COUNT.numpy()
 
 
@@ -65,7 +64,7 @@ def write_drive_poses(
     )
 
 
-def write_sign_rows(path: Path, rows: SignRows, drive: Drive) -> None:
+def write_sign_rows(path: Path, rows: SignRows, drive: Drive, world: World) -> None:
     """`signs.parquet` of a journey."""
     write_sign_detections(
         path,
@@ -73,7 +72,7 @@ def write_sign_rows(path: Path, rows: SignRows, drive: Drive) -> None:
         rows.shape,
         rows.corners_px,
         rows.code,
-        all_codes(),
+        all_codes(world.signs.code),
         rows.score,
         rows.track,
     )
@@ -141,7 +140,7 @@ def write_survey(folder: Path, world: World, provenance: dict) -> None:
         {
             "format": "crowdmap-map",
             "version": 1,
-            "origin": ORIGIN,
+            "origin": asdict(world.origin),
             "shared_covariance": [0.0] * 9,
             "provenance": provenance,
         },

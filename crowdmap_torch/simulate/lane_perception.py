@@ -209,6 +209,10 @@ def _parameters(
 ) -> Float[np.ndarray, "d k"]:
     """Parameters on markers: `ahead` of the vehicle, or `share` of those across the road."""
     markers = world.markers
+    if drive.passing is not None:
+        foot = drive.passing.foot[frame[:, None], marker]
+        along = foot + drive.passing.sense[frame[:, None], marker] * ahead
+        return np.where(np.isnan(along), share * markers.length()[marker], along)
     station = drive.station[frame, None] + drive.direction * ahead
     if world.road.closed:
         station = world.road.wrap(station)
@@ -262,11 +266,34 @@ def _points(
     inside = np.clip(parameter, 0, world.markers.length()[marker])
     point = world.markers.at(marker, inside)
     if left_m:
-        station = world.markers.station[marker] + inside
+        point = point + left_m * _leftwards(world, drive, frame, marker, inside)
+    return point, is_painted
+
+
+def _leftwards(
+    world: World,
+    drive: Drive,
+    frame: Int[np.ndarray, " d"],
+    marker: Int[np.ndarray, "d k"],
+    parameter: Float[np.ndarray, "d k"],
+) -> Float[np.ndarray, "d k 3"]:
+    """Unit vectors to the left of markers, as the driver sees them; zero for those that run across the road."""
+    markers = world.markers
+    if drive.passing is None:
+        station = markers.station[marker] + parameter
         runs_across = np.isnan(station)
         left = world.road.leftwards(np.where(runs_across, 0.0, station)) * drive.direction
-        point = point + left_m * np.where(runs_across[..., None], 0.0, left)
-    return point, is_painted
+    else:
+        runs_across = np.isnan(drive.passing.foot[frame[:, None], marker])
+        before, after = (
+            np.maximum(parameter - 0.5, 0),
+            np.minimum(parameter + 0.5, markers.length()[marker]),
+        )
+        onward = markers.at(marker, after) - markers.at(marker, before)
+        onward = onward * drive.passing.sense[frame[:, None], marker][..., None]
+        left = np.stack((-onward[..., 1], onward[..., 0], np.zeros(marker.shape)), axis=-1)
+        left = left / np.maximum(np.linalg.norm(left, axis=-1, keepdims=True), 1e-12)
+    return np.where(runs_across[..., None], 0.0, left)
 
 
 def _seen(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -96,7 +97,7 @@ class SignRows:
     corners_px: Float[np.ndarray, "d 8 2"]
     """The first corners of a row count, as many as its shape has."""
     code: Int[np.ndarray, " d"]
-    """Index into `all_codes()`; -1 null."""
+    """Index into `all_codes` of the world's signs; -1 null."""
     score: Float[np.ndarray, " d"]
     track: Int[np.ndarray, " d"]
     """-1 null."""
@@ -112,9 +113,10 @@ class SignRows:
         return SignRows(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
-def all_codes() -> tuple[str, ...]:
-    """Every traffic-sign code that a detector knows."""
-    return tuple(dict.fromkeys([*(c for codes in CODES.values() for c in codes), *PANEL_CODES]))
+def all_codes(of_signs: Iterable[str | None] = ()) -> tuple[str, ...]:
+    """Every traffic-sign code that a detector knows, those of the signs of a world included."""
+    known = [*(c for codes in CODES.values() for c in codes), *PANEL_CODES]
+    return tuple(dict.fromkeys([*known, *sorted({c for c in of_signs if c is not None})]))
 
 
 def corner_sigma(

@@ -202,7 +202,7 @@ def _codes(
     config: SignDetectionConfig,
     rng: np.random.Generator,
 ) -> Int[np.ndarray, " d"]:
-    known = all_codes()
+    known = all_codes(signs.code)
     index = {code: k for k, code in enumerate(known)}
     true_code = np.array([-1 if c is None else index[c] for c in signs.code], dtype=np.int64)
     code = true_code[sign]

@@ -21,6 +21,7 @@ from crowdmap_torch.ranges import (
     Share,
     Speed,
 )
+from crowdmap_torch.simulate.passing import Passing
 from crowdmap_torch.simulate.rigs import SimulatedRig
 from crowdmap_torch.simulate.worlds import World
 
@@ -87,6 +88,8 @@ class Drive:
     road_normal_camera: Float[np.ndarray, "f 3"]
     """True unit normal from the camera towards the road."""
     camera_height: Float[np.ndarray, " f"]
+    passing: Passing | None = None
+    """Where it is beside markers that do not follow the stations."""
 
     def __len__(self) -> int:
         return len(self.t)

@@ -10,9 +10,13 @@ from jaxtyping import Float
 
 from crowdmap_torch.ranges import LengthOrNone, Range, Rate, Settings, Span, Speed
 from crowdmap_torch.simulate.markers import Markers, Strip, lay_markers
+from crowdmap_torch.simulate.recordings import Recording
 from crowdmap_torch.simulate.roads import Road, RoadShape, block_road, open_road
 from crowdmap_torch.simulate.signposts import SignConfig, WorldSigns, put_up_signs
+from crowdmap_torch.tables import Origin
 
+ORIGIN = Origin(32.9, -117.2, 120.0)
+"""Where worlds are that are no maps."""
 RUN_IN_M = 40.0
 """An open road is this much longer than a drive: journeys start at differing stations."""
 
@@ -136,6 +140,12 @@ class World:
     """Offsets of the lanes' middles by direction of travel (1, -1), the innermost first."""
     lights: Float[np.ndarray, " l"]
     """Stations of the traffic lights."""
+    origin: Origin = ORIGIN
+    """Where it is on the earth."""
+    recordings: tuple[Recording, ...] = ()
+    """Drives that are driven again; none: cars drive along the road."""
+    is_map: bool = False
+    """Whether its markers are those of a map, which do not follow the stations."""
 
 
 def build_world(config: WorldConfig, rng: np.random.Generator) -> World:

@@ -38,8 +38,8 @@ def test_poses_are_written_frame_by_frame(journey, tmp_path: Path):
     assert read_poses(path).sigma_position is None
 
 
-def test_every_detection_is_a_row_with_the_corners_of_its_shape(journey, tmp_path: Path):
-    files.write_sign_rows(tmp_path / "signs.parquet", journey.signs, journey.drive)
+def test_every_detection_is_a_row_with_the_corners_of_its_shape(suburb, journey, tmp_path: Path):
+    files.write_sign_rows(tmp_path / "signs.parquet", journey.signs, journey.drive, suburb)
     table = pq.read_table(tmp_path / "signs.parquet").to_pylist()
     assert len(table) == len(journey.signs)
     for row, shape in zip(table, journey.signs.shape.tolist(), strict=True):

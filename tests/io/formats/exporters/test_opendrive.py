@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,8 +15,13 @@ from worlds.marked_roads import bend, line, marked_map, two_way_road
 from worlds.opendrive_reader import ReadRoad, facing, number
 
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.formats.composing.compose import write_survey_alone
+from crowdmap_torch.io.formats.composing.map_files import map_of_file
+from crowdmap_torch.io.formats.composing.parts import Asked
 from crowdmap_torch.io.formats.exporters.features import lane_points
 from crowdmap_torch.io.formats.exporters.opendrive import write
+from crowdmap_torch.io.formats.importers import argoverse2
+from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.tables import HdMap
 
 
@@ -195,3 +201,25 @@ def test_the_checker_of_asam_finds_nothing(world: str, tmp_path: Path):
     assert len([*result.iter("Checker")]) > 15
     assert [issue.attrib["description"] for issue in result.iter("Issue")] == []
     assert not [c for c in result.iter("Checker") if c.attrib["status"] == "error"]
+
+
+def test_lanes_of_a_real_map_are_where_its_markers_are(real_data, tmp_path: Path):
+    for name in ("argoverse2/7fab2350-7eaf-3b7e-a39d-6937a4c1bede", "lanelet2/intersection.osm"):
+        path = real_data(name)
+        if path.suffix == ".osm":
+            hd_map = map_of_file(path)
+        else:
+            write_survey_alone(
+                tmp_path / "SURVEY",
+                [replace(argoverse2.read((path,), Asked()), track=None, rig=None)],
+            )
+            hd_map = read_map(tmp_path / "SURVEY")
+        markers = KDTree(np.concatenate([dense(p) for p in lane_points(hd_map.lanes)]))
+        roads = exported(hd_map, tmp_path)
+        found = [
+            e for road in roads for s in np.linspace(0, road.length, 40) for e in road.edges(s)
+        ]
+        away = markers.query(found)[0]
+        # Where two pieces of a marker leave a gap its border goes on.
+        assert np.mean(away > 0.05) < 0.005, name
+        assert len(roads) > 10
