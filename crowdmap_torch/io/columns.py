@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from crowdmap_torch.io.budget import FREE_BYTES, budget_now, file_size
 from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.io.faults import Fault, FaultsGathered, gathered
 
 MAX_PLACE_M = 1e6
 """Nothing that is mapped is further from the origin, in any direction: the plane has left the earth there [m]."""
@@ -46,7 +47,11 @@ class Sheet:
 
     def __init__(self, path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> None:
         self.path = path
-        self._table = _read(path, required, optional)
+        self._table, missing = _read(path, required, optional)
+        self._wrong: dict[str, Bool[np.ndarray, " n"]] = {}
+        for name, rule in missing.items():
+            self._keep(rule, np.zeros(0, dtype=np.int64))
+            self._wrong[name] = np.ones(len(self), dtype=bool)
 
     def __len__(self) -> int:
         return self._table.num_rows
@@ -58,11 +63,41 @@ class Sheet:
         """The error that says in which row of which file a rule is broken."""
         return InputError(f"{self.path}: {'' if row is None else f'row {row}: '}{rule}")
 
-    def refuse(self, is_bad: Bool[np.ndarray, " n"], rule: Callable[[int], str]) -> None:
-        """Raises for the first bad row; `rule` words what is wrong with a row."""
-        if is_bad.any():
-            row = int(is_bad.argmax())
-            raise self.fault(rule(row), row)
+    def refuse(
+        self, is_bad: Bool[np.ndarray, " n"], rule: Callable[[int], str], *columns: str
+    ) -> None:
+        """Raises for the first bad row; `rule` words what is wrong with a row.
+
+        Where faults are gathered all bad rows are kept instead, but for those in which one of `columns` is wrong
+        already (any column, if none is named).
+        """
+        if gathered() is not None:
+            known = [self._wrong[name] for name in columns or self._wrong if name in self._wrong]
+            is_bad = is_bad & ~np.logical_or.reduce(known) if known else is_bad
+        if not is_bad.any():
+            return
+        rows = np.flatnonzero(is_bad)
+        self._keep(rule(int(rows[0])), rows)
+        for name in columns:
+            self._wrong[name] = self._wrong.get(name, False) | is_bad
+
+    def leave_out(self, reason: str, rows: Int[np.ndarray, " k"]) -> None:
+        """Notes rows, where faults are gathered, that have a fault of their own and are not used."""
+        faults = gathered()
+        if faults is not None and len(rows):
+            faults.append(Fault(self.path, reason, tuple(np.unique(rows).tolist()), drops=True))
+
+    def require_sound(self) -> None:
+        """Where faults are gathered, ends the reading of a file that has some: what follows rests on its values."""
+        if any(f.path == self.path and not f.drops for f in gathered() or ()):
+            raise FaultsGathered(f"{self.path}: has faults")
+
+    def _keep(self, rule: str, rows: Int[np.ndarray, " k"]) -> None:
+        """Raises a fault, or gathers it."""
+        faults = gathered()
+        if faults is None:
+            raise self.fault(rule, int(rows[0]) if len(rows) else None)
+        faults.append(Fault(self.path, rule, tuple(rows.tolist())))
 
     def integers(self, name: str, *, null: int | None = None) -> Int[np.ndarray, " n"]:
         """Whole numbers; where `null` is given, a null or missing column holds it instead."""
@@ -90,6 +125,7 @@ class Sheet:
         self.refuse(
             known & ~np.isfinite(numbers),
             lambda row: f"column {name!r}: expected a finite number, found {numbers[row]}",
+            name,
         )
         return numbers
 
@@ -129,6 +165,7 @@ class Sheet:
                 f"column {name!r}: {texts[row].as_py()!r} is unknown; expected one of "
                 + ", ".join(names)
             ),
+            name,
         )
         return codes
 
@@ -159,6 +196,7 @@ class Sheet:
             self.refuse(
                 column.is_valid().to_numpy(zero_copy_only=False) & (size != count),
                 lambda row: f"column {name!r}: expected {count} numbers, found {size[row]}",
+                name,
             )
         return lists
 
@@ -223,8 +261,11 @@ class Sheet:
         if bad.any():
             first = int(bad.argmax())
             found = values[first] if flat[first].is_valid else "null"
-            rule = f"column {name!r}: expected finite numbers, found {found}"
-            raise self.fault(rule, int(row[first]))
+            is_bad = np.zeros(len(self), dtype=bool)
+            is_bad[row[bad]] = True
+            self.refuse(
+                is_bad, lambda _: f"column {name!r}: expected finite numbers, found {found}", name
+            )
         return values
 
     def _column(
@@ -232,7 +273,7 @@ class Sheet:
     ) -> pa.Array | None:
         """The column as one array of a type that fits; None if unknown throughout and `nullable`."""
         if name not in self:
-            return None
+            return self._stand_in(expected) if name in self._wrong else None
         column = self._table.column(name).combine_chunks()
         if pa.types.is_null(column.type) and (nullable or len(column) == 0):
             # Nobody can tell the type of a column without a value; it is what was expected.
@@ -240,14 +281,38 @@ class Sheet:
         if not fits(column.type):
             is_coded = pa.types.is_dictionary(column.type)
             found = column.type.value_type if is_coded else column.type
-            raise self.fault(f"column {name!r} has type {found}; expected {expected}")
+            rule = f"column {name!r} has type {found}; expected {expected}"
+            self._keep(rule, np.zeros(0, dtype=np.int64))
+            self._wrong[name] = np.ones(len(self), dtype=bool)
+            return self._stand_in(expected)
         if not nullable and column.null_count:
-            row = int(column.is_null().to_numpy(zero_copy_only=False).argmax())
-            raise self.fault(f"column {name!r} is null; expected a value in every row", row)
+            is_null = column.is_null().to_numpy(zero_copy_only=False)
+            rule = f"column {name!r} is null; expected a value in every row"
+            self.refuse(is_null, lambda _: rule, name)
+            values = column.to_pylist()
+            filled = [_STAND_INS[expected] if value is None else value for value in values]
+            return pa.array(filled, column.type)
         return column
+
+    def _stand_in(self, expected: str) -> pa.Array:
+        """Values in place of a column that is not there, so that the others are looked at."""
+        return pa.array([_STAND_INS[expected]] * len(self), _EMPTY[expected])
+
+
+_STAND_INS: dict[str, object] = {
+    "int64": 0,
+    "float64": 0.0,
+    "float": 0.0,
+    "bool": False,
+    "string": "",
+    "list<double>": [],
+    "list<list<double>>": [],
+}
+"""What stands for a value that is wrong, while faults are gathered."""
 
 
 _EMPTY = {
+    "bool": pa.bool_(),
     "int64": pa.int64(),
     "float64": pa.float64(),
     "float": pa.float64(),
@@ -257,7 +322,10 @@ _EMPTY = {
 }
 
 
-def _read(path: Path, required: Sequence[str], optional: Sequence[str]) -> pa.Table:
+def _read(
+    path: Path, required: Sequence[str], optional: Sequence[str]
+) -> tuple[pa.Table, dict[str, str]]:
+    """What a file has of the columns; and what is to be said of each that is missing, where faults are gathered."""
     try:
         size = file_size(path, budget_now().table_bytes)
     except InputError as error:
@@ -266,12 +334,12 @@ def _read(path: Path, required: Sequence[str], optional: Sequence[str]) -> pa.Ta
         with pq.ParquetFile(path) as file:
             names = file.schema_arrow.names
             wanted = [name for name in (*required, *optional) if name in names]
-            _check_names(path, names, required, wanted)
+            missing = _missing(path, names, required, wanted)
             _weigh(path, size, file.metadata, wanted)
             texts = [name for name in wanted if _is_text(file.schema_arrow.field(name).type)]
         # Texts stay what they are in the file, numbers of a list: a long one in every row would fill the memory.
         with pq.ParquetFile(path, read_dictionary=texts) as file:
-            return file.read(columns=wanted)
+            return file.read(columns=wanted), missing
     except (pa.ArrowException, OSError, *_ARROW_TRIPS) as error:
         if isinstance(error, InputError):
             raise
@@ -304,18 +372,22 @@ def _weigh(path: Path, size: int, footer: pq.FileMetaData, wanted: Sequence[str]
         )
 
 
-def _check_names(
+def _missing(
     path: Path, names: Sequence[str], required: Sequence[str], wanted: Sequence[str]
-) -> None:
-    for name in required:
-        if name not in names:
-            raise InputError(
-                f"{path}: column {name!r} is missing; expected {', '.join(required)}, "
-                f"found {', '.join(names) or 'no columns'}"
-            )
+) -> dict[str, str]:
+    """What is to be said of each column that is missing; InputError with the first, unless faults are gathered."""
+    missing = {
+        name: f"column {name!r} is missing; expected {', '.join(required)}, "
+        f"found {', '.join(names) or 'no columns'}"
+        for name in required
+        if name not in names
+    }
+    if missing and gathered() is None:
+        raise InputError(f"{path}: {next(iter(missing.values()))}")
     for name in wanted:
         if names.count(name) > 1:
             raise InputError(f"{path}: column {name!r} is there twice; expected it once")
+    return missing
 
 
 def _is_text(kind: pa.DataType) -> bool:

@@ -64,12 +64,12 @@ def _load_dataset(folder: Path, strict: bool, wanted: Sequence[str] | None) -> D
     names: list[tuple[str, ...]] = []
     rejected: list[RejectedJourney] = []
     rigs: dict[str, Rig | InputError] = {}
-    folders = _journey_folders(folder)
+    folders = journey_folders(folder)
     for journey_folder in folders if wanted is None else _named(folders, wanted):
         try:
             journey, type_names = _load_journey(journey_folder, folder / "rigs", rigs)
         except InputError as error:
-            name = _printable(journey_folder.name)
+            name = printable(journey_folder.name)
             if strict:
                 raise InputError(f"journey {name!r}: {one_line(error)}") from error
             rejected.append(RejectedJourney(name, one_line(error)))
@@ -139,7 +139,8 @@ def row_count(journey: Journey, kind: str) -> int:
     return len(detections) + sum(dropped)
 
 
-def _journey_folders(folder: Path) -> list[Path]:
+def journey_folders(folder: Path) -> list[Path]:
+    """The folders of a dataset's journeys, by name; InputError if there are none."""
     journeys = folder / "journeys"
     if not journeys.is_dir():
         raise InputError(f"{journeys}: the folder is missing; expected one folder for each journey")
@@ -160,7 +161,7 @@ def _named(folders: Sequence[Path], wanted: Sequence[str]) -> list[Path]:
         own = [p for p in folders if p.name == name]
         found = own or [p for p in folders if fnmatchcase(p.name, name)]
         if not found:
-            known = ", ".join(_printable(p.name) for p in folders[:_MOST_NAMED])
+            known = ", ".join(printable(p.name) for p in folders[:_MOST_NAMED])
             more = len(folders) - _MOST_NAMED
             raise InputError(
                 f"{folders[0].parent}: no journey is called {shown(name)}; there are {known}"
@@ -179,11 +180,7 @@ def _load_journey(
         raise InputError(f"{folder}: a link that leads to no folder; expected a journey's folder")
     head = read_json(folder / "journey.json")
     head.require_format(JOURNEY_FORMAT)
-    journey_id = head.name("journey_id")
-    if journey_id != folder.name:
-        raise head.fault(
-            f"{journey_id!r} in the folder {folder.name!r}; expected the same name", "journey_id"
-        )
+    journey_id = read_journey_id(head)
     rig_id = head.name("rig")
     if rig_id not in rigs:
         try:
@@ -215,6 +212,15 @@ def _load_journey(
     return journey, signs.type_names
 
 
+def read_journey_id(head: Document) -> str:
+    """The `journey_id` of a journey.json; InputError unless it is its folder's name."""
+    journey_id, folder = head.name("journey_id"), head.path.parent.name
+    if journey_id != folder:
+        rule = f"{journey_id!r} in the folder {folder!r}; expected the same name"
+        raise head.fault(rule, "journey_id")
+    return journey_id
+
+
 def _vehicle_id(stated: object) -> str:
     """A name, or a number for one, as it can be shown anywhere; whatever else is there names nobody."""
     if isinstance(stated, bool) or not isinstance(stated, str | int):
@@ -238,7 +244,7 @@ def _copies(journeys: Sequence[Journey]) -> dict[str, str]:
     }
 
 
-def _printable(name: str) -> str:
+def printable(name: str) -> str:
     """A folder's name on one line, whatever bytes it has."""
     text = os.fsencode(name).decode("utf-8", "backslashreplace")
     return text if text.isprintable() else ascii(text)[1:-1]

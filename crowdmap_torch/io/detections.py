@@ -69,18 +69,20 @@ def read_sign_detections(
         lambda row: (
             f"{polygon.SHAPES[shape[row]]} with {u.count[row]} corners; expected {expected[row]}"
         ),
+        *("shape", "u", "v"),
     )
     score = _score(sheet)
     track = np.maximum(sheet.integers("track", null=-1), -1)
     codes = sheet.strings("type", optional=True)
     type_names = tuple(sorted(name for name in codes.unique().to_pylist() if name is not None))
     type_code = sheet.codes("type", type_names, optional=True)
+    sheet.require_sound()
 
     slot = np.minimum(np.arange(polygon.MAX_CORNERS), expected[:, None] - 1)
     at = u.start[:, None] + slot
     corners_px = torch.from_numpy(np.stack((u.values[at], v.values[at]), axis=-1))
     ideal, faults = _corner_faults(camera, corners_px, torch.from_numpy(shape))
-    usable, dropped = _count(DROPPED_SIGN, faults)
+    usable, dropped = _count(sheet, DROPPED_SIGN, faults, np.arange(len(sheet)))
     corner_columns = corners_px.flatten(1).numpy().T
     order = rows_by_content(
         usable.numpy(), frame, (*corner_columns, shape, type_code, score, track)
@@ -113,26 +115,31 @@ def read_lane_detections(
     frame = _frame_index(sheet, frame_number)
     u, v = _pixels(sheet)
     sheet.refuse(
-        u.count < 2, lambda row: f"lane marker with {u.count[row]} points; expected 2 or more"
+        u.count < 2,
+        lambda row: f"lane marker with {u.count[row]} points; expected 2 or more",
+        *("u", "v"),
     )
     lane_type = sheet.codes("type", LANE_TYPES, optional=True)
     score = _score(sheet)
+    sheet.require_sound()
 
     given = np.stack((u.values, v.values), axis=-1)
     px = torch.from_numpy(given[points_by_place(given, u.row)])
     ideal, faults = _point_faults(camera, px)
-    usable, dropped = _count(DROPPED_LANE_POINT, faults)
+    usable, dropped = _count(sheet, DROPPED_LANE_POINT, faults, u.row)
     kept = usable.numpy()
     row = u.row[kept]
     remaining = np.bincount(row, minlength=len(sheet))
     short = remaining < 2
     flat = ~short & (_extent(px.numpy()[kept], row, len(sheet)) < _MIN_EXTENT_PX)
     good, dropped_rows = _count(
+        sheet,
         DROPPED_LANE,
         {
             "fewer than two usable points": torch.from_numpy(short),
             "no length": torch.from_numpy(flat),
         },
+        np.arange(len(sheet)),
     )
     content = rank_of_lists(px.numpy()[kept], row, len(sheet))
     order = rows_by_content(good.numpy(), frame, (content, lane_type, score))
@@ -213,6 +220,7 @@ def _frame_index(sheet: Sheet, frame_number: Int[np.ndarray, " f"]) -> Int[np.nd
             f"frame {frame[row]} is not in poses.parquet, whose frames are "
             f"{frame_number[0]} to {frame_number[-1]}; expected a frame that exists"
         ),
+        "frame",
     )
     return index
 
@@ -222,6 +230,7 @@ def _pixels(sheet: Sheet) -> tuple[Lists, Lists]:
     sheet.refuse(
         u.count != v.count,
         lambda row: f"{u.count[row]} values in u and {v.count[row]} in v; expected as many in both",
+        *("u", "v"),
     )
     return u, v
 
@@ -231,6 +240,7 @@ def _score(sheet: Sheet) -> Float[np.ndarray, " n"]:
     sheet.refuse(
         (score < 0) | (score > 1),
         lambda row: f"column 'score': expected 0 to 1, found {score[row]:g}",
+        "score",
     )
     return score
 
@@ -267,14 +277,15 @@ def _point_faults(
 
 
 def _count(
-    prefix: str, faults: dict[str, Bool[Tensor, " n"]]
+    sheet: Sheet, prefix: str, faults: dict[str, Bool[Tensor, " n"]], row: Int[np.ndarray, " n"]
 ) -> tuple[Bool[Tensor, " n"], dict[str, int]]:
-    """Which of n have no fault, and how many have which one first."""
+    """Which of n, of these rows of a file, have no fault, and how many have which one first."""
     usable = torch.ones_like(next(iter(faults.values())))
     dropped = {}
     for reason, is_faulty in faults.items():
         if count := int((usable & is_faulty).sum()):
             dropped[prefix + reason] = count
+            sheet.leave_out(prefix + reason, row[(usable & is_faulty).numpy()])
         usable = usable & ~is_faulty
     return usable, dropped
 

@@ -64,11 +64,13 @@ def read_poses(path: Path) -> LinkPoses:
             f"quaternion qx qy qz qw has length {length[row]:.6g}; "
             f"expected 1 within {UNIT_TOLERANCE}"
         ),
+        *_QUATERNION,
     )
     R = se3.from_quaternion(torch.from_numpy(quaternion))
     sigmas = [_sigma(sheet, name) for name in _SIGMA_POSITION]
     known = [s for s in sigmas if s is not None]
     sigma_rotation = _sigma(sheet, _SIGMA_ROTATION)
+    sheet.require_sound()
     return LinkPoses(
         frame_number=torch.from_numpy(frame),
         t_ns=torch.from_numpy(t_ns),
@@ -104,7 +106,7 @@ def _refuse_far(sheet: Sheet, position: Float[np.ndarray, "f 3"]) -> None:
             "metres east, north and up of dataset.json's. Are they UTM or earth-centred coordinates?"
         )
 
-    sheet.refuse(np.abs(position).max(axis=-1, initial=0.0) > MAX_PLACE_M, rule)
+    sheet.refuse(np.abs(position).max(axis=-1, initial=0.0) > MAX_PLACE_M, rule, *_POSITION)
 
 
 def _refuse_leaps(
@@ -115,6 +117,9 @@ def _refuse_leaps(
 ) -> None:
     """Refuses what no car drives within a second or between two frames: another second's jump is noise."""
     before = np.arange(len(frame))
+    if (np.diff(t_ns) <= 0).any():
+        # That is refused by itself.
+        return
     # The first frame a second later, the next one if that is later still, or the last of all.
     after = np.searchsorted(t_ns, t_ns + 10**9)
     after = np.clip(after, before, len(frame) - 1)
@@ -127,6 +132,7 @@ def _refuse_leaps(
             f"{(t_ns[after[row]] - t_ns[row]) * 1e-9:.3g} s; expected {MAX_SPEED_MPS:g} m/s at most. "
             "Are positions in metres and t_ns in nanoseconds? Cut the journey where it jumps"
         ),
+        *("frame", "t_ns", *_POSITION),
     )
 
 
@@ -135,6 +141,7 @@ def _increasing(sheet: Sheet, name: str) -> Int[np.ndarray, " f"]:
     sheet.refuse(
         np.abs(values.astype(float)) > _MOST_COUNTED,
         lambda row: f"column {name!r}: {values[row]}; expected {_MOST_COUNTED:g} at most",
+        name,
     )
     stays = np.concatenate(([False], values[1:] <= values[:-1]))
     sheet.refuse(
@@ -143,6 +150,7 @@ def _increasing(sheet: Sheet, name: str) -> Int[np.ndarray, " f"]:
             f"column {name!r}: {values[row]} after {values[row - 1]}; "
             "expected strictly increasing values, sort the file by frame"
         ),
+        name,
     )
     return values
 
@@ -156,5 +164,6 @@ def _sigma(sheet: Sheet, name: str) -> Float[np.ndarray, " f"] | None:
             f"column {name!r}: expected 0 or more, {MAX_SIGMA:g} at most, found {sigma[row]}; "
             "leave it null if it is unknown"
         ),
+        name,
     )
     return np.where(known, sigma, np.median(sigma[known])) if known.any() else None

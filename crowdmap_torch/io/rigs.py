@@ -16,6 +16,7 @@ from crowdmap_torch.geometry.rig import camera_in_link
 from crowdmap_torch.io.budget import read_bytes
 from crowdmap_torch.io.documents import Document, read_yaml
 from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.io.faults import attempted
 from crowdmap_torch.tables import Rig
 
 MIN_CLOSING_SHARE = 0.9
@@ -59,6 +60,25 @@ def read_camera(folder: Path) -> Camera:
     rig = read_yaml(folder / "rig.yaml")
     rig.allow(("camera",), ("road", "mount"))
     return _read_camera(rig.part("camera"))
+
+
+def faults_of_rig(folder: Path) -> Camera | None:
+    """Gathers the first fault of each section of rig.yaml; the camera, if it can be used."""
+    path, camera = folder / "rig.yaml", None
+    with attempted(path):
+        rig = read_yaml(path)
+        with attempted(path):
+            rig.allow(("camera", "road"), ("mount",))
+        with attempted(path):
+            if "camera" in rig.content:
+                camera = _read_camera(rig.part("camera"))
+        with attempted(path):
+            if "road" in rig.content:
+                _read_road(rig.part("road"))
+        with attempted(path):
+            if "mount" in rig.content:
+                _read_mount(rig.part("mount"), folder)
+    return camera
 
 
 def rig_yaml(

@@ -1,0 +1,124 @@
+"""All faults of all files, by the rules of the readers."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.faults import Fault, gathered
+from crowdmap_torch.io.inspection import inspect_dataset
+
+
+@pytest.fixture
+def bad(tiny_folder: Path, tmp_path: Path) -> Path:
+    """A copy of a small data set, to be spoilt."""
+    return Path(shutil.copytree(tiny_folder, tmp_path / "bad"))
+
+
+def refused(folder: Path) -> list[Fault]:
+    return [fault for fault in inspect_dataset(folder) if not fault.drops]
+
+
+def changed(path: Path, name: str, column: object) -> None:
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(table.column_names.index(name), name, pa.array(column)), path)
+
+
+def test_nothing_is_refused_of_a_good_data_set_and_faults_are_raised_again_after(
+    tiny_folder: Path,
+) -> None:
+    assert refused(tiny_folder) == []
+    assert gathered() is None
+
+
+def test_rows_that_are_left_out_are_named_as_many_as_the_loader_counts(tiny_folder: Path) -> None:
+    dropped = [fault for fault in inspect_dataset(tiny_folder) if fault.drops]
+    rows = sum(len(f.rows) for f in dropped if not f.rule.startswith("lane point"))
+    counted = [j.dropped.items() for j in load_dataset(tiny_folder).journeys]
+    known = sum(n for items in counted for why, n in items if not why.startswith("lane point"))
+    assert rows == known
+
+
+def test_every_wrong_row_of_every_column_is_named(bad: Path) -> None:
+    path = bad / "journeys" / "journey-000" / "poses.parquet"
+    table = pq.read_table(path)
+    x, qw = (table[name].to_numpy().copy() for name in ("x", "qw"))
+    x[[2, 7]], qw[[4, 5]] = np.nan, 3.0
+    t_ns = table["t_ns"].to_numpy().copy()
+    t_ns[3] = t_ns[2]
+    for name, column in (("x", x), ("qw", qw), ("t_ns", t_ns)):
+        changed(path, name, column)
+    found = {fault.rule.split(":")[0].split(" has ")[0]: fault.rows for fault in refused(bad)}
+    assert found == {"column 't_ns'": (3,), "column 'x'": (2, 7), "quaternion qx qy qz qw": (4, 5)}
+    assert {fault.path for fault in refused(bad)} == {path}
+
+
+def test_a_wrong_type_and_a_missing_column_hide_nothing_else(bad: Path) -> None:
+    path = bad / "journeys" / "journey-001" / "poses.parquet"
+    table = pq.read_table(path)
+    z = table["z"].to_numpy().copy()
+    z[1] = np.inf
+    table = table.set_column(table.column_names.index("x"), "x", table["x"].cast(pa.float32()))
+    table = table.set_column(table.column_names.index("z"), "z", pa.array(z)).drop_columns(["qz"])
+    pq.write_table(table, path)
+    rules = [fault.rule for fault in refused(bad)]
+    assert [rule[:24] for rule in rules] == [
+        "column 'qz' is missing; ",
+        "column 'x' has type floa",
+        "column 'z': expected a f",
+    ]
+
+
+def test_a_broken_rig_and_broken_poses_do_not_keep_detections_from_being_looked_at(
+    bad: Path,
+) -> None:
+    for path in bad.glob("rigs/*/rig.yaml"):
+        path.write_text(path.read_text().replace("width: 1280", "width: wide"))
+    journey = bad / "journeys" / "journey-002"
+    (journey / "poses.parquet").write_bytes(b"nothing")
+    signs = pq.read_table(journey / "signs.parquet")
+    shapes = signs["shape"].to_pylist()
+    shapes[1] = "circle"
+    changed(journey / "signs.parquet", "shape", shapes)
+    found = {(f.path.name, f.rows) for f in refused(bad)}
+    assert found == {("rig.yaml", ()), ("poses.parquet", ()), ("signs.parquet", (1,))}
+
+
+def test_every_section_of_a_text_file_is_looked_at(bad: Path) -> None:
+    head = json.loads((bad / "dataset.json").read_text())
+    (bad / "dataset.json").write_text(json.dumps({**head, "version": 2, "origin": {}}))
+    rig = next(iter(sorted(bad.glob("rigs/*/rig.yaml"))))
+    rig.write_text(rig.read_text().replace("brown_conrady", "lomo").replace("height_m", "height"))
+    rules = [fault.rule for fault in refused(bad)]
+    assert [rule.split(":")[0] for rule in rules] == [
+        "version",
+        "origin.lat_deg",
+        "camera.model",
+        "road",
+    ]
+
+
+def test_a_survey_is_looked_at_too(bad: Path) -> None:
+    head = json.loads((bad / "survey" / "map.json").read_text())
+    head["origin"]["lat_deg"] += 1
+    (bad / "survey" / "map.json").write_text(json.dumps(head))
+    (fault,) = refused(bad)
+    assert fault.path == bad / "survey" / "map.json" and "expected that of" in fault.rule
+    (bad / "survey" / "signs.parquet").write_bytes(b"nothing")
+    (fault,) = refused(bad)
+    assert fault.path == bad / "survey" / "signs.parquet"
+
+
+def test_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="folder is missing"):
+        inspect_dataset(tmp_path / "none")
+    (fault,) = [f for f in inspect_dataset(tmp_path) if f.path.name == "journeys"]
+    assert "one folder for each journey" in fault.rule
