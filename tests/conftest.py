@@ -80,6 +80,17 @@ def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def winding_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four drives of a winding street, without a mistake, of vehicles that are as they say."""
+    from crowdmap_torch.simulate.dataset import write_dataset
+    from crowdmap_torch.soak.varied import winding_street
+
+    folder = tmp_path_factory.mktemp("winding") / "good"
+    write_dataset(winding_street(), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
 def tiny(tiny_folder: Path) -> Dataset:
     """The same dataset, loaded."""
     from crowdmap_torch.io.datasets import load_dataset

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from crowdmap_torch.tables import Journey
@@ -24,6 +24,8 @@ _LEAST_SHARE = 0.05
 """Less of a journey in another one may be chance, where outlines are in whole pixels."""
 _SAMPLES = 64
 """Boxes of each journey that are looked for in all others before two are compared as a whole."""
+_LEAST_SPREAD_PX = 100 * SAME_PX
+"""Pixels that all lie within less are none, and boxes of any two drives are the same to `SAME_PX`."""
 _LANE_PX = 1e6
 """What keeps boxes of lane markers away from those of signs."""
 
@@ -43,7 +45,9 @@ def overlaps(journeys: Sequence[Journey]) -> tuple[Overlap, ...]:
 
     Of two the one with more detections stays, of equals the first.
     """
-    boxes = [_boxes(journey) for journey in journeys]
+    boxes = [
+        _boxes(journey) if _spread(journey) > _LEAST_SPREAD_PX else _NO_BOX for journey in journeys
+    ]
     count = np.array([len(own) for own in boxes], dtype=np.int64)
     if not count.sum():
         return ()
@@ -82,8 +86,31 @@ def copies(journeys: Sequence[Journey]) -> tuple[Overlap, ...]:
     return tuple(overlap for overlap in overlaps(journeys) if overlap.share >= COPY_SHARE)
 
 
+def common_frames(journey: Journey, other: Journey) -> Int[np.ndarray, " k"]:
+    """Frames of a journey, by row, from the first to the last with a detection that is in another one too."""
+    tree = KDTree(_boxes(other))
+    boxes = _all_boxes(journey)
+    there = np.isfinite(tree.query(boxes, p=np.inf, distance_upper_bound=SAME_PX)[0])
+    frame = torch.cat((journey.signs.frame, journey.lanes.frame)).cpu().numpy()[there]
+    return np.arange(frame.min(), frame.max() + 1) if len(frame) else frame
+
+
+_NO_BOX = np.zeros((0, 4))
+
+
+def _spread(journey: Journey) -> float:
+    """Over how much of the image a journey's detections reach [px]."""
+    px = torch.cat((journey.signs.corners_px.flatten(0, 1), journey.lane_points.px))
+    return float((px.amax(0) - px.amin(0)).max()) if len(px) else 0.0
+
+
 def _boxes(journey: Journey) -> Float[np.ndarray, "b 4"]:
     """Boxes of all outlines and lane markers [px], those of a car that stands still once."""
+    return np.unique(_all_boxes(journey), axis=0)
+
+
+def _all_boxes(journey: Journey) -> Float[np.ndarray, "d 4"]:
+    """A box for each outline, then for each lane marker [px]."""
     corners = journey.signs.corners_px
     signs = torch.cat((corners.amin(1), corners.amax(1)), dim=1)
     point, n = journey.lane_points.px, len(journey.lanes)
@@ -93,4 +120,4 @@ def _boxes(journey: Journey) -> Float[np.ndarray, "b 4"]:
         for which in ("amin", "amax")
     )
     lanes = torch.cat((low, high), dim=1) + _LANE_PX
-    return np.unique(torch.cat((signs, lanes)).cpu().numpy(), axis=0)
+    return torch.cat((signs, lanes)).cpu().numpy()

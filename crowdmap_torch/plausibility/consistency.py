@@ -17,9 +17,11 @@ from scipy.special import ndtr, stdtrit
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.geometry.camera import Camera, unproject
+from crowdmap_torch.geometry.camera import Camera, project, unproject
 from crowdmap_torch.geometry.triangulation import midpoint_ragged
-from crowdmap_torch.plausibility.finding import Finding
+from crowdmap_torch.plausibility.finding import Finding, Repair
+from crowdmap_torch.plausibility.rig import COEFFICIENT_ORDERS, reordered
+from crowdmap_torch.plausibility.units import LENGTH_UNITS
 from crowdmap_torch.tables import Journey, Tracklets
 
 
@@ -43,6 +45,12 @@ class ConsistencyLimits:
     """Journeys from which a lever arm is concluded: what one shows is mostly the drift of its poses."""
     least_lever_m: float = 0.6
     """Shorter levers are not named."""
+    size_m: tuple[float, float] = (0.05, 25.0)
+    """Median size of the signs: less and more is another unit of positions."""
+    usual_m: tuple[float, float] = (0.3, 2.5)
+    """The same under the unit that is named."""
+    meeting_px: float = 15.0
+    """How far rays may miss each other where their meeting alone tells a unit."""
     sure: float = 3.0
     """Standard deviations that a lever has to exceed; of few journeys as many as are as rare by Student's distribution."""
 
@@ -56,6 +64,7 @@ class _Views:
     """Views of the signs of one journey: raw pixels of the outlines' middles."""
 
     px: Float[Tensor, "m 2"]
+    extent_px: Float[Tensor, " m"]
     frame: Int[Tensor, " m"]
     sign: Int[Tensor, " m"]
     count: int
@@ -69,21 +78,28 @@ def consistency_findings(
     """Mistakes of all journeys under which their signs' rays do not meet."""
     limits = limits or ConsistencyLimits()
     given_px: list[float] = []
+    sizes: list[float] = []
     levers: list[_Lever] = []
     tried: dict[str, list[float]] = {}
     findings: dict[str, Finding] = {}
     for journey, tracks in zip(journeys, tracklets, strict=True):
         views = _views(journey, tracks, limits)
         rays = None if views is None else _rays(views, journey.rig.camera)
-        given = math.inf if rays is None else _misfit(journey, rays, 0, limits)
-        if views is None or rays is None or not math.isfinite(given):
+        met = None if rays is None else _met(journey, rays, 0, limits)
+        if views is None or rays is None or met is None:
             continue
+        given = met.misfit_px
+        sizes.append(float((views.extent_px * met.distance)[met.counted].median()) / rays.focal_px)
         given_px.append(given)
         levers.append(_lever(journey, rays))
         for name, camera, shift, finding in _instead(journey, limits):
             other = rays if camera is journey.rig.camera else _rays(views, camera)
-            tried.setdefault(name, []).append(_misfit(journey, other, shift, limits) / given)
+            under = _met(journey, other, shift, limits)
+            ratio = math.inf if under is None else under.misfit_px / given
+            tried.setdefault(name, []).append(ratio)
             findings[name] = finding
+    if scale := _scale_findings(sizes, limits):
+        return scale
     named = []
     for name, ratios in tried.items():
         found, is_shift = torch.tensor(ratios), findings[name].kind == "frame-offset"
@@ -114,7 +130,8 @@ def _views(journey: Journey, tracks: Tracklets, limits: ConsistencyLimits) -> _V
     sign, compact = label[used].unique(return_inverse=True)
     corners = journey.signs.corners_px[used]
     middle = (corners.amin(1) + corners.amax(1)) / 2
-    return _Views(middle, journey.signs.frame[used], compact, len(sign))
+    extent = (corners.amax(1) - corners.amin(1)).amax(-1)
+    return _Views(middle, extent, journey.signs.frame[used], compact, len(sign))
 
 
 @dataclass(frozen=True)
@@ -133,8 +150,26 @@ def _rays(views: _Views, camera: Camera) -> _Rays:
     return _Rays(views, ray, closes, float(camera.K[0, 0]))
 
 
-def _misfit(journey: Journey, rays: _Rays, shift: int, limits: ConsistencyLimits) -> float:
-    """Median over the views of the distance between a sign's middle and where all its rays together put it [px]."""
+@dataclass(frozen=True)
+class _Met:
+    """Where all rays to a sign together put its middle, beside each of them."""
+
+    point_world: Float[Tensor, "m 3"]
+    off_px: Float[Tensor, " m"]
+    """How far the sign's middle was seen from there."""
+    distance: Float[Tensor, " m"]
+    """From the camera [m]."""
+    counted: Bool[Tensor, " m"]
+    """Of signs that are seen from directions that differ, in front of the camera."""
+
+    @property
+    def misfit_px(self) -> float:
+        """The median over the views that count."""
+        return float(self.off_px[self.counted].median())
+
+
+def _met(journey: Journey, rays: _Rays, shift: int, limits: ConsistencyLimits) -> _Met | None:
+    """Where rays meet if detections are of frames so many later; None if too few signs are seen so that one could tell."""
     views = rays.views
     frame = (views.frame + shift).clamp(0, journey.frame_count - 1)
     T_world_camera = journey.T_world_camera[frame]
@@ -149,8 +184,89 @@ def _misfit(journey: Journey, rays: _Rays, shift: int, limits: ConsistencyLimits
     least = math.radians(limits.least_parallax_deg) ** 2
     counted = rays.closes & (spread[views.sign] > least) & ((towards * ray).sum(-1) > 0)
     if int(counted.sum()) < limits.least_views:
-        return math.inf
-    return float(angle[counted].median()) * rays.focal_px
+        return None
+    return _Met(point[views.sign], angle * rays.focal_px, to_point.norm(dim=-1), counted)
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """The views of signs whose rays meet, beside where they meet."""
+
+    detected_px: Float[Tensor, "m 2"]
+    """Middles of outlines, raw pixels."""
+    projected_px: Float[Tensor, "m 2"]
+    """Where the point in which all rays of a sign meet is in the same image."""
+    point_world: Float[Tensor, "m 3"]
+    size: Float[Tensor, " m"]
+    """The sign's larger side, by its distance [m]."""
+    sign: Int[Tensor, " m"]
+
+
+def meeting_of(
+    journey: Journey, tracks: Tracklets, limits: ConsistencyLimits | None = None
+) -> Meeting | None:
+    """Where signs are seen, and where they would be from all frames together; None if that tells nothing."""
+    limits = limits or ConsistencyLimits()
+    views = _views(journey, tracks, limits)
+    met = None if views is None else _met(journey, _rays(views, journey.rig.camera), 0, limits)
+    if views is None or met is None:
+        return None
+    T_camera_world = se3.inverse(journey.T_world_camera[views.frame])
+    px, is_seen = project(journey.rig.camera, se3.transform(T_camera_world, met.point_world))
+    kept = met.counted & is_seen
+    size = views.extent_px * met.distance / journey.rig.camera.K[0, 0]
+    columns = (views.px, px, met.point_world, size, views.sign)
+    return Meeting(*(column[kept] for column in columns))
+
+
+def _scale_findings(sizes: Sequence[float], limits: ConsistencyLimits) -> list[Finding]:
+    """Whether signs have the size of signs."""
+    if not sizes:
+        return []
+    usual = sorted(sizes)[len(sizes) // 2]
+    low, high = limits.size_m
+    if low <= usual <= high:
+        return []
+    low, high = limits.usual_m
+    units = [(unit, f) for unit, f in LENGTH_UNITS if low <= usual * f <= high]
+    unit, factor = units[0] if len(units) == 1 else ("another unit", 0.0)
+    return [
+        Finding(
+            "scale",
+            f"signs are {usual:.2g} m large in the median",
+            f"positions are in {unit}",
+            "write metres",
+            repair=Repair("length-unit", (factor,)) if factor else None,
+        )
+    ]
+
+
+def crawl_findings(journey: Journey, tracks: Tracklets, limits: ConsistencyLimits) -> list[Finding]:
+    """Whether a car that hardly moves does so in kilometres: `journey` as it is then, with its signs told apart.
+
+    A car that stands sees all signs in one direction: under no unit do their rays meet.
+    """
+    views = _views(journey, tracks, limits)
+    met = None if views is None else _met(journey, _rays(views, journey.rig.camera), 0, limits)
+    if views is None or met is None or met.misfit_px > limits.meeting_px:
+        return []
+    focal_px = float(journey.rig.camera.K[0, 0])
+    usual = float((views.extent_px * met.distance)[met.counted].median()) / focal_px
+    low, high = limits.usual_m
+    if not low <= usual <= high:
+        return []
+    return [
+        Finding(
+            "crawl",
+            f"the car hardly moves, and signs would be {usual:.2g} mm large",
+            "positions are in kilometres",
+            "write metres",
+            repair=Repair("length-unit", (_PER_KM,)),
+        )
+    ]
+
+
+_PER_KM = 1e3
 
 
 @dataclass(frozen=True)
@@ -239,20 +355,25 @@ def _instead(
                 f"detections are taken {abs(shift)} frames {'later' if shift > 0 else 'earlier'}",
                 cause,
                 "number detections by the frame that they were made in",
+                repair=Repair("frames", (float(shift),)),
             ),
         )
     lens = camera.distortion
     if camera.model == "brown_conrady" and bool((lens != 0).any()):
-        k1, k2, *rest = (*lens.tolist(), 0.0)[:5]
-        order = lens.new_tensor([k1, k2, rest[1], rest[2], rest[0]])
-        yield (
-            "coefficient-order",
-            replace(camera, distortion=order),
-            0,
-            Finding(
-                "coefficient-order",
-                "the coefficients are k1, k2, k3, p1, p2",
-                "distortion coefficients are in another order",
-                "write k1, k2, p1, p2, k3 (OpenCV's order)",
-            ),
-        )
+        for name, order in COEFFICIENT_ORDERS.items():
+            other = reordered(camera, order)
+            # A lens is hardly off its axis: p1 and p2 are the smallest.
+            if 2 * float(other.distortion[2:4].abs().max()) > float(lens[2:4].abs().max()):
+                continue
+            yield (
+                f"coefficient-order {name}",
+                other,
+                0,
+                Finding(
+                    "coefficient-order",
+                    f"the coefficients are {name}",
+                    "distortion coefficients are in another order",
+                    "write k1, k2, p1, p2, k3 (OpenCV's order)",
+                    repair=Repair("coefficients", tuple(map(float, order))),
+                ),
+            )

@@ -11,11 +11,15 @@ import torch
 from crowdmap_torch.io.columns import Sheet
 from crowdmap_torch.io.copies import overlaps
 from crowdmap_torch.noise.positioning import PositioningNoise
-from crowdmap_torch.plausibility.consistency import consistency_findings
+from crowdmap_torch.plausibility.consistency import (
+    ConsistencyLimits,
+    consistency_findings,
+    crawl_findings,
+)
 from crowdmap_torch.plausibility.detections import Outlines, detection_findings
-from crowdmap_torch.plausibility.finding import Finding, gathered
-from crowdmap_torch.plausibility.lens import lens_findings
-from crowdmap_torch.plausibility.poses import pose_findings
+from crowdmap_torch.plausibility.finding import Finding, Repair, gathered
+from crowdmap_torch.plausibility.lens import is_bare, lens_findings
+from crowdmap_torch.plausibility.poses import axes_alike, in_kilometres, pose_findings
 from crowdmap_torch.plausibility.rig import rig_findings
 from crowdmap_torch.tables import Dataset, Journey
 from crowdmap_torch.tracking.sign_features import SignAssociationConfig
@@ -25,31 +29,52 @@ _MOST_TRIANGULATED = 12
 """Journeys whose signs are triangulated for the look: mistakes are made in all alike."""
 
 
-@torch.no_grad()
 def look_over(
     folder: Path, dataset: Dataset, positioning: PositioningNoise, config: SignAssociationConfig
 ) -> tuple[Finding, ...]:
-    """What looks wrong with the journeys of the data set in `folder`, each finding once.
+    """What looks wrong with the journeys of the data set in `folder`, each finding once."""
+    return gathered(findings_by_journey(folder, dataset, positioning, config))
 
-    Signs are triangulated only where nothing else is wrong: a mistake that shows by itself spoils them too.
+
+@torch.no_grad()
+def findings_by_journey(
+    folder: Path, dataset: Dataset, positioning: PositioningNoise, config: SignAssociationConfig
+) -> list[tuple[str, Finding]]:
+    """What looks wrong, with the journey in which it was seen.
+
+    Signs are triangulated only where nothing else is wrong: a mistake that shows by itself spoils them too. Of many sound
+    journeys some are triangulated, and what is found is said of all of them.
     """
     found = [
         (journey.journey_id, finding)
         for journey in dataset.journeys
         for finding in _findings_of(folder / "journeys" / journey.journey_id, journey, dataset)
     ]
+    found += list(_alike(found, dataset.journeys))
     found += list(_overlaps(dataset.journeys))
+    found += [
+        (journey.journey_id, finding)
+        for journey in dataset.journeys
+        for finding in _crawling(journey, positioning, config)
+    ]
     spoiled = {journey for journey, finding in found if finding.kind not in _HARMLESS}
-    sound = [j for j in dataset.journeys if j.journey_id not in spoiled and len(j.signs)]
-    some = sound[:: -(-len(sound) // _MOST_TRIANGULATED)] if sound else []
+    sound = [j for j in dataset.journeys if j.journey_id not in spoiled]
+    seen = [j for j in sound if len(j.signs)]
+    some = seen[:: -(-len(seen) // _MOST_TRIANGULATED)] if seen else []
     tracklets = [associate_signs(journey, positioning, config) for journey in some]
     # What is wrong with the lens keeps rays from meeting, too.
-    found += lens_findings(some, tracklets, positioning) or [
-        (journey.journey_id, finding)
-        for finding in consistency_findings(some, tracklets)
-        for journey in some
+    of_lens = lens_findings(some, tracklets, positioning)
+    if not of_lens:
+        return found + [
+            (journey.journey_id, finding)
+            for finding in consistency_findings(some, tracklets)
+            for journey in sound
+        ]
+    named = {name: finding for name, finding in of_lens}
+    by_lens = {is_bare(j.rig): named[j.journey_id] for j in some if j.journey_id in named}
+    return found + [
+        (j.journey_id, by_lens[is_bare(j.rig)]) for j in sound if is_bare(j.rig) in by_lens
     ]
-    return gathered(found)
 
 
 _HARMLESS = ("sigmas", "overlap", "road-normal", "camera-height", "leap")
@@ -61,6 +86,34 @@ def _findings_of(folder: Path, journey: Journey, dataset: Dataset) -> Iterator[F
     yield from pose_findings(journey, dataset.origin)
     signs, lanes = (_outlines(folder / f"{name}.parquet") for name in ("signs", "lanes"))
     yield from detection_findings(signs, lanes, journey.rig)
+
+
+_OF_AXES = ("quaternion-order", "camera-from-world", "north-east-down", "body-frame", "camera-axes")
+
+
+def _alike(
+    found: Sequence[tuple[str, Finding]], journeys: Sequence[Journey]
+) -> Iterator[tuple[str, Finding]]:
+    """Mistakes of axes in journeys that show them too little to be named by themselves."""
+    named = {(f.kind, f.cause): f for _, f in found if f.kind in _OF_AXES}
+    known = {journey for journey, finding in found if finding.kind not in _HARMLESS}
+    for journey in journeys:
+        if journey.journey_id in known:
+            continue
+        for finding in named.values():
+            if (own := axes_alike(journey, finding)) is not None:
+                yield journey.journey_id, own
+
+
+def _crawling(
+    journey: Journey, positioning: PositioningNoise, config: SignAssociationConfig
+) -> list[Finding]:
+    """Whether a journey that hardly moves is one in kilometres."""
+    larger = in_kilometres(journey)
+    if larger is None or not len(journey.signs):
+        return []
+    tracks = associate_signs(larger, positioning, config)
+    return crawl_findings(larger, tracks, ConsistencyLimits())
 
 
 def _outlines(path: Path) -> Outlines:
@@ -81,5 +134,6 @@ def _overlaps(journeys: Sequence[Journey]) -> Iterator[tuple[str, Finding]]:
                 f"{overlap.share:.0%} of the detections are those of {other!r}",
                 "one drive was cut into journeys that overlap",
                 "cut it anew: the map takes what is in two journeys for two drives",
+                repair=Repair("cut-overlap", of=other),
             ),
         )

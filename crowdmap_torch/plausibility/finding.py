@@ -10,6 +10,17 @@ _NAMED = 3
 
 
 @dataclass(frozen=True)
+class Repair:
+    """The one change of a data set's files that puts a mistake right; `checking.repair` carries it out."""
+
+    name: str
+    numbers: tuple[float, ...] = ()
+    """Such as a factor, a shift, or the rows of matrices."""
+    of: str = ""
+    """A journey or columns, where it is about some of them."""
+
+
+@dataclass(frozen=True)
 class Finding:
     """Something that FORMAT.md allows and physics or habit do not: probably a mistake."""
 
@@ -23,6 +34,8 @@ class Finding:
     """What to do about it."""
     journeys: tuple[str, ...] = ()
     """The journeys in which it was seen; none: it is the data set's."""
+    repair: Repair | None = None
+    """None where more than one thing may be done, or what is to be written is not in the files."""
 
     def line(self, total: int) -> str:
         """One line for a person; `total` journeys were looked at."""

@@ -35,7 +35,7 @@ from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean,
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.banded_schur import BandBackend
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
-from crowdmap_torch.plausibility.finding import Finding
+from crowdmap_torch.plausibility.finding import Finding, Repair
 from crowdmap_torch.residuals.pose import (
     gauss_markov_start,
     gauss_markov_step,
@@ -44,7 +44,7 @@ from crowdmap_torch.residuals.pose import (
 from crowdmap_torch.residuals.reprojection import MIN_DEPTH, into_camera
 from crowdmap_torch.signs.triangulate import shape_by_vote, usable_rows, views_of
 from crowdmap_torch.signs.views import SignViews, thinned
-from crowdmap_torch.tables import Journey, Tracklets
+from crowdmap_torch.tables import Journey, Rig, Tracklets
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,8 @@ class LensLimits:
     they are four standard deviations off."""
     most: float = 1.5
     """Largest share of the lens that may be missing, but for two standard deviations: more has another cause."""
+    all_of_it: float = 0.3
+    """A share this near to 1, or within three standard deviations of it, is taken for all of the lens."""
     sure: float = 5.0
     """Standard deviations from zero of a lens that a rig does not have, ..."""
     least_k1: float = 0.02
@@ -115,12 +117,12 @@ def lens_findings(
     bare: dict[str, MissingLens] = {}
     for journey, tracks in zip(journeys, tracklets, strict=True):
         camera = journey.rig.camera
-        is_bare = camera.model == "brown_conrady" and not bool((camera.distortion != 0).any())
-        distortion = camera.K.new_tensor([_UNIT_K1, 0, 0, 0] if is_bare else [])
+        has_none = is_bare(journey.rig)
+        distortion = camera.K.new_tensor([_UNIT_K1, 0, 0, 0] if has_none else [])
         other = replace(camera, model="brown_conrady", distortion=distortion)
         found = missing_lens(journey, tracks, other, positioning, limits)
         if found is not None:
-            (bare if is_bare else bent)[journey.journey_id] = found
+            (bare if has_none else bent)[journey.journey_id] = found
     named = (_undistorted(bent.values(), limits), _without_lens(bare.values(), limits))
     return [
         (journey, finding)
@@ -128,6 +130,11 @@ def lens_findings(
         if finding is not None
         for journey in own
     ]
+
+
+def is_bare(rig: Rig) -> bool:
+    """Whether a rig's lens has no distortion."""
+    return rig.camera.model == "brown_conrady" and not bool((rig.camera.distortion != 0).any())
 
 
 def _undistorted(found: Collection[MissingLens], limits: LensLimits) -> Finding | None:
@@ -143,6 +150,7 @@ def _undistorted(found: Collection[MissingLens], limits: LensLimits) -> Finding 
         f"(sigma {sigma:.0%})",
         "detections are in undistorted pixels",
         "write raw pixels, or a rig without distortion",
+        repair=Repair("distort") if abs(share - 1) < max(limits.all_of_it, 3 * sigma) else None,
     )
 
 

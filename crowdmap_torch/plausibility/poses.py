@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.plausibility.finding import Finding
+from crowdmap_torch.plausibility.finding import Finding, Repair
+from crowdmap_torch.plausibility.units import UnitLimits, unit_findings, usual_speed
 from crowdmap_torch.tables import Journey, Origin
 
 
@@ -28,10 +29,12 @@ class PoseLimits:
     """Median angle between optical axis and motion: a front camera looks ahead."""
     upright_deg: float = 35.0
     """Median angle between the image's down and the world's."""
+    leaning: float = 0.25
+    """A share of these limits from which on poses are doubted, ..."""
+    much_better: float = 4.0
+    """... if they fit so many times better as something else: of a drive to the east w x y z looks nearly like x y z w."""
     baseline_m: float = 3.0
     """Way over which the direction of motion is taken."""
-    fastest_mps: float = 70.0
-    """Median speed of the moving part."""
     leap_mps: float = 150.0
     """Speed of a single step: more is a teleport."""
     leap_m: float = 5.0
@@ -40,12 +43,12 @@ class PoseLimits:
     """Distance from the origin: the tangent plane is a kilometre over the ground there."""
     high_m: float = 2_000.0
     """Height over the origin, in either direction."""
-    frame_s: tuple[float, float] = (0.004, 2.0)
-    """Median time between frames."""
     sigma_m: tuple[float, float] = (1e-3, 100.0)
     """Median sigma of positions."""
     sigma_rad: tuple[float, float] = (1e-6, 0.5)
     """The same of rotations."""
+    units: UnitLimits = field(default_factory=UnitLimits)
+    """How often frames come, and how fast cars are."""
 
 
 _AXES = {
@@ -53,6 +56,8 @@ _AXES = {
     "x ahead, y left, z up": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
     "x ahead, y right, z down": ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
 }
+_UPRIGHT = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+"""The same of a camera as OpenGL has it: x right, y up, z back."""
 _DEGREE_M = 111e3
 """Length of a degree of latitude."""
 _TWO_MISTAKES = 0.3
@@ -76,6 +81,20 @@ def pose_findings(
     ]
 
 
+def in_kilometres(journey: Journey, limits: PoseLimits | None = None) -> Journey | None:
+    """A journey that hardly moves as it is if positions are in kilometres; None if it is none, or would be no drive then."""
+    limits = limits or PoseLimits()
+    T = _links(journey)
+    speed = usual_speed(journey.t_ns.double().numpy() * 1e-9, T[:, :3, 3].numpy(), limits.units)
+    low, high = limits.units.usual_mps
+    if speed is None or not low <= 1e3 * speed <= high:
+        return None
+    T = se3.make(T[:, :3, :3], 1e3 * (T[:, :3, 3] - T[0, :3, 3]))
+    larger = replace(journey, T_world_camera=T @ journey.rig.T_link_camera)
+    misfit = _misfit(larger.T_world_camera, limits)
+    return larger if misfit is not None and misfit < 1 else None
+
+
 def _place(journey: Journey, origin: Origin, limits: PoseLimits) -> Finding | None:
     """Positions that are no metres from the origin."""
     across = _links(journey)[:, :2, 3]
@@ -83,11 +102,15 @@ def _place(journey: Journey, origin: Origin, limits: PoseLimits) -> Finding | No
     is_still = float((across.amax(0) - across.amin(0)).norm()) < 1.0
     near = {(origin.lat_deg, origin.lon_deg), (origin.lon_deg, origin.lat_deg)}
     if is_still and any(abs(x - a) < 1 and abs(y - b) < 1 for a, b in near):
+        is_lat_first = abs(x - origin.lat_deg) < 1 and abs(y - origin.lon_deg) < 1
+        is_lon_first = abs(x - origin.lon_deg) < 1 and abs(y - origin.lat_deg) < 1
+        is_sure = is_lat_first != is_lon_first
         return Finding(
             "degrees",
             f"x and y stay at ({x:.4f}, {y:.4f}), the origin's latitude and longitude",
             "positions are in degrees",
             "write metres east, north and up of dataset.json's origin",
+            repair=Repair("degrees", (float(is_lon_first),)) if is_sure else None,
         )
     if math.hypot(x, y) < limits.far_m:
         return None
@@ -100,6 +123,7 @@ def _place(journey: Journey, origin: Origin, limits: PoseLimits) -> Finding | No
             "these are UTM coordinates",
             "subtract the origin's and turn them to true north: x, y, z are metres east, north "
             "and up of dataset.json's origin",
+            repair=Repair("utm", (float(_zone(origin)), float(origin.lat_deg < 0))),
         )
     return Finding(
         "far-away",
@@ -111,9 +135,14 @@ def _place(journey: Journey, origin: Origin, limits: PoseLimits) -> Finding | No
 
 def _utm(origin: Origin) -> tuple[float, float]:
     """About where the origin is in its UTM zone, to some kilometres [m]."""
-    central_deg = 6 * math.floor(origin.lon_deg / 6) + 3
+    central_deg = 6 * _zone(origin) - 183
     east = 5e5 + _DEGREE_M * math.cos(math.radians(origin.lat_deg)) * (origin.lon_deg - central_deg)
     return east, _DEGREE_M * origin.lat_deg + (1e7 if origin.lat_deg < 0 else 0)
+
+
+def _zone(origin: Origin) -> int:
+    """The UTM zone of the origin, those around Norway and Spitsbergen not widened."""
+    return min(math.floor(origin.lon_deg / 6) + 31, 60)
 
 
 def _heights(journey: Journey, origin: Origin, limits: PoseLimits) -> Iterator[Finding]:
@@ -126,6 +155,7 @@ def _heights(journey: Journey, origin: Origin, limits: PoseLimits) -> Iterator[F
             f"poses are {z:.0f} m over an origin that is itself {height:.0f} m high",
             "z holds heights over the ellipsoid or the sea",
             "write heights over dataset.json's origin",
+            repair=Repair("heights", (height,)),
         )
     elif abs(z) > limits.high_m:
         yield Finding(
@@ -137,29 +167,16 @@ def _heights(journey: Journey, origin: Origin, limits: PoseLimits) -> Iterator[F
 
 
 def _speeds(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
+    if journey.frame_count < 2:
+        return
+    position = journey.T_world_camera[:, :3, 3]
+    named = [*unit_findings(journey.t_ns.double().numpy(), position.numpy(), limits.units)]
+    if named:
+        yield from named
+        return
     seconds = journey.t_ns.diff().double() * 1e-9
-    if not len(seconds):
-        return
-    step = journey.T_world_camera[:, :3, 3].diff(dim=0).norm(dim=-1)
-    between = float(seconds.median())
-    low, high = limits.frame_s
-    if not low <= between <= high:
-        yield Finding(
-            "frame-times",
-            f"frames are {between:.2g} s apart in the median",
-            "t_ns is not in nanoseconds, or frames are missing",
-            "write nanoseconds since 1970-01-01 UTC",
-        )
-        return
+    step = position.diff(dim=0).norm(dim=-1)
     speed = step / seconds
-    moving = speed[step > 0.01]
-    if len(moving) and float(moving.median()) > limits.fastest_mps:
-        yield Finding(
-            "speed",
-            f"the car drives {float(moving.median()):.0f} m/s in the median",
-            "positions or times are in another unit",
-            "write metres and nanoseconds",
-        )
     leaps = (speed > limits.leap_mps) & (step > limits.leap_m)
     if bool(leaps.any()):
         first = int(leaps.nonzero()[0, 0])
@@ -188,76 +205,129 @@ def _sigmas(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
                 f"{name} are {usual:.3g} {unit} in the median",
                 "positioning does not know its own errors, or the unit is another",
                 "leave the columns out where they are not known",
+                repair=Repair("no-sigmas", of=name),
             )
 
 
 def _axes(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
     given = _misfit(journey.T_world_camera, limits)
-    if given is None or given < 1:
+    if given is None or given < limits.leaning:
         return
     tried = [
-        (misfit + extra, kind, cause, cure)
-        for extra, kind, cause, cure, T_world_camera in _instead(journey)
+        (misfit + extra, finding)
+        for extra, finding, T_world_camera in _instead(journey)
         if (misfit := _misfit(T_world_camera, limits)) is not None
     ]
-    best = min(tried, default=None, key=lambda found: found[0])
-    axis, down = _angles(journey.T_world_camera, limits)
-    evidence = (
-        f"the camera looks {axis:.0f} degrees off the direction of travel "
-        f"and its image's down is {down:.0f} degrees off the world's"
-    )
-    if best is not None and best[0] < min(1.0, given / 2):
-        yield Finding(best[1], evidence, best[2], best[3])
-    else:
+    best = min(tried, default=(math.inf, None), key=lambda found: found[0])
+    if best[1] is not None and best[0] < min(
+        1.0, given / (2 if given >= 1 else limits.much_better)
+    ):
+        yield replace(best[1], evidence=_seen(journey, limits))
+    elif given >= 1:
         yield Finding(
             "axes",
-            evidence,
+            _seen(journey, limits),
             "poses, mount and camera do not fit each other",
             "poses are T_world_link of the mount's pose_link, quaternions qx qy qz qw; the "
             "camera's x is right, y down, z ahead",
         )
 
 
-def _instead(journey: Journey) -> Iterator[tuple[float, str, str, str, Float[Tensor, "f 4 4"]]]:
-    """What poses may be instead: how much a less usual mistake has to fit better, its kind, cause and cure, the poses."""
+def axes_alike(
+    journey: Journey, named: Finding, limits: PoseLimits | None = None
+) -> Finding | None:
+    """What was named in another journey, if this one fits better under it too: mistakes are made in all alike."""
+    limits = limits or PoseLimits()
+    given = _misfit(journey.T_world_camera, limits)
+    for _, finding, T_world_camera in _instead(journey):
+        if given is None or (finding.kind, finding.cause) != (named.kind, named.cause):
+            continue
+        misfit = _misfit(T_world_camera, limits)
+        if misfit is not None and misfit < given / 2:
+            return replace(finding, evidence=_seen(journey, limits))
+    return None
+
+
+def _seen(journey: Journey, limits: PoseLimits) -> str:
+    axis, down = _angles(journey.T_world_camera, limits)
+    return (
+        f"the camera looks {axis:.0f} degrees off the direction of travel "
+        f"and its image's down is {down:.0f} degrees off the world's"
+    )
+
+
+def _instead(journey: Journey) -> Iterator[tuple[float, Finding, Float[Tensor, "f 4 4"]]]:
+    """What poses may be instead: how much a less usual mistake has to fit better, what it is called, the poses."""
     T_link_camera, T = journey.rig.T_link_camera, _links(journey)
     R, p = T[:, :3, :3], T[:, :3, 3]
     x, y, z, w = se3.to_quaternion(R).unbind(-1)
     yield (
         0.0,
-        "quaternion-order",
-        "quaternions are stored as w x y z",
-        "store qx qy qz qw",
+        Finding(
+            "quaternion-order",
+            "",
+            "quaternions are stored as w x y z",
+            "store qx qy qz qw",
+            repair=Repair("quaternion-order"),
+        ),
         se3.make(se3.from_quaternion(torch.stack((y, z, w, x), dim=-1)), p) @ T_link_camera,
     )
     yield (
         0.0,
-        "camera-from-world",
-        "poses are the world's in the camera (T_camera_world)",
-        "store their inverses, T_world_camera",
+        Finding(
+            "camera-from-world",
+            "",
+            "poses are the world's in the camera (T_camera_world)",
+            "store their inverses, T_world_camera",
+            repair=Repair("inverse-poses"),
+        ),
         se3.inverse(T) @ T_link_camera,
     )
+    same = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     world = se3.make(R.new_tensor(_NORTH_EAST_DOWN), p.new_zeros(3))
-    down = (
+    down = Finding(
         "north-east-down",
+        "",
         "the world is north-east-down",
         "write east-north-up: swap x and y of positions and world axes, and turn z over",
+        repair=_axes_repair(_NORTH_EAST_DOWN, same),
     )
-    yield (0.0, *down, world @ T @ T_link_camera)
+    yield 0.0, down, world @ T @ T_link_camera
     if not torch.equal(T_link_camera, torch.eye(4).to(T_link_camera)):
         return
-    for name, axes in _AXES.items():
+    of_body = (
+        "poses are of a body frame with {}, not the camera's",
+        "give the rig a mount (rig.urdf), or store the camera's own poses",
+    )
+    upright = "poses are of a camera with x right, y up, z back (OpenGL)"
+    named = [
+        *(
+            ("body-frame", of_body[0].format(name), of_body[1], axes)
+            for name, axes in _AXES.items()
+        ),
+        ("camera-axes", upright, "turn y and z of the camera's axes over", _UPRIGHT),
+    ]
+    for kind, cause, cure, axes in named:
         body = se3.make(R.new_tensor(axes), p.new_zeros(3))
-        yield (
-            0.0,
-            "body-frame",
-            f"poses are of a body frame with {name}, not the camera's",
-            "give the rig a mount (rig.urdf), or store the camera's own poses",
-            T @ body,
-        )
+        yield 0.0, Finding(kind, "", cause, cure, repair=_axes_repair(same, axes)), T @ body
         # Of a car that drives north-east the one looks like the other.
-        both = f"{down[1]} and the body's axes are {name}"
-        yield (_TWO_MISTAKES, down[0], both, down[2], world @ T @ body)
+        both = replace(
+            down,
+            cause=f"{down.cause} and {cause}",
+            cure=f"{down.cure}; {cure}",
+            repair=_axes_repair(_NORTH_EAST_DOWN, axes),
+        )
+        yield _TWO_MISTAKES, both, world @ T @ body
+
+
+_Axes = tuple[tuple[int, int, int], ...]
+
+
+def _axes_repair(world: _Axes, camera: _Axes) -> Repair:
+    """Positions and rotations turned by `world`, and the camera's axes put where `camera` has them."""
+    return Repair(
+        "axes", tuple(float(x) for matrix in (world, camera) for row in matrix for x in row)
+    )
 
 
 def _links(journey: Journey) -> Float[Tensor, "f 4 4"]:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from crowdmap_torch.plausibility.finding import Finding
+import torch
+
+from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.plausibility.finding import Finding, Repair
 from crowdmap_torch.tables import Rig
 
 
@@ -21,7 +24,7 @@ class RigLimits:
     view_deg: tuple[float, float] = (12.0, 175.0)
     """Horizontal field of view of the pinhole part."""
     tangential: float = 0.02
-    """Tangential distortion p1, p2 of a lens that is not broken."""
+    """Tangential distortion p1, p2 of a lens that is not broken; half of it where another order makes a usual lens."""
     centre: float = 0.25
     """Distance of the principal point from the image's middle, as a share of its size."""
 
@@ -36,6 +39,7 @@ def rig_findings(rig: Rig, limits: RigLimits | None = None) -> Iterator[Finding]
             f"the road normal of rig {rig.rig_id!r} points up in the image (y {down:.2f})",
             "it is the road's own normal, from the road upwards",
             "road.normal points from the camera to the road: turn its sign",
+            repair=Repair("turn-normal"),
         )
     elif down < math.cos(math.radians(limits.tilt_deg)):
         yield Finding(
@@ -47,12 +51,14 @@ def rig_findings(rig: Rig, limits: RigLimits | None = None) -> Iterator[Finding]
         )
     low, high = limits.height_m
     if not low <= rig.camera_height <= high:
-        unit = next((u for u, f in _UNITS if low <= rig.camera_height * f <= high), None)
+        units = [(u, f) for u, f in _UNITS if low <= rig.camera_height * f <= high]
+        unit, factor = units[0] if len(units) == 1 else (None, 1.0)
         yield Finding(
             "camera-height",
             f"the camera of rig {rig.rig_id!r} is {rig.camera_height:g} m over the road",
             "road.height_m is not in metres" if unit is None else f"road.height_m is in {unit}",
             "write the distance from the camera centre to the road plane in metres",
+            repair=None if unit is None else Repair("height-unit", (factor,)),
         )
     yield from _camera(rig, limits)
 
@@ -73,15 +79,45 @@ def _camera(rig: Rig, limits: RigLimits) -> Iterator[Finding]:
             "fx, fy, cx, cy are of an image of another size, or not in pixels",
             "write them in pixels of the images that detections are of",
         )
+    if camera.model != "brown_conrady":
+        return
     lens = camera.distortion.tolist()
-    if camera.model == "brown_conrady" and max(map(abs, lens[2:4]), default=0) > limits.tangential:
+    tangential, repair = max(map(abs, lens[2:4]), default=0), _reordered(camera, limits)
+    if tangential > (limits.tangential if repair is None else limits.tangential / 2):
         yield Finding(
             "coefficient-order",
             f"tangential distortion p1, p2 of rig {rig.rig_id!r} is {lens[2]:g}, {lens[3]:g}, more than "
-            "any lens has",
+            "usual lenses have",
             "distortion coefficients are in another order",
             "write k1, k2, p1, p2, k3 (OpenCV's order)",
+            repair=repair,
         )
+
+
+COEFFICIENT_ORDERS = {
+    "k1, k2, k3, p1, p2": (0, 1, 3, 4, 2),
+    "k1, p1, p2, k2, k3": (0, 3, 1, 2, 4),
+    "p1, p2, k1, k2, k3": (2, 3, 0, 1, 4),
+}
+"""How else coefficients are written: where in that order k1, k2, p1, p2, k3 stand."""
+
+
+def reordered(camera: Camera, order: tuple[int, ...]) -> Camera:
+    """The camera with its coefficients taken to be in another order."""
+    given = torch.nn.functional.pad(camera.distortion, (0, max(5 - len(camera.distortion), 0)))
+    return replace(camera, distortion=given[[*order, *range(5, len(given))]])
+
+
+def _reordered(camera: Camera, limits: RigLimits) -> Repair | None:
+    """The order in which the coefficients are those of a lens, if it is one only."""
+    fits = []
+    for order in COEFFICIENT_ORDERS.values():
+        k1, k2, p1, p2, k3 = reordered(camera, order).distortion[:5].tolist()
+        if max(abs(p1), abs(p2)) < min(limits.tangential / 4, abs(k1) / 4) and abs(k1) >= max(
+            abs(k2), abs(k3)
+        ):
+            fits.append(order)
+    return Repair("coefficients", tuple(map(float, fits[0]))) if len(fits) == 1 else None
 
 
 _UNITS = (("centimetres", 0.01), ("millimetres", 0.001), ("feet", 0.3048))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from crowdmap_torch.geometry.camera import Camera
@@ -71,6 +72,21 @@ def test_pixels_of_another_image_are_named_with_its_size() -> None:
     half = [[0.5, 0.0], [0.0, 0.5]]
     (found,) = detection_findings(changed(squares(), half), changed(markers(), half), RIG)
     assert (found.kind, "640 x 400" in found.cause) == ("image-size", True)
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.4, 0.5, 2 / 3, 1.5, 2.0, 3.0])
+def test_the_size_of_the_image_is_told_from_others_by_markers_that_are_parallel(scale: float):
+    signs, lanes = (Outlines((r.px + 0.5) * scale - 0.5, r.count) for r in (squares(), markers()))
+    (found,) = detection_findings(signs, lanes, RIG)
+    assert found.repair is not None
+    assert found.repair.numbers[0] == pytest.approx(1 / scale, rel=1e-6)
+
+
+def test_corners_row_by_row_are_told_from_other_orders() -> None:
+    signs = squares()
+    rows = Outlines(signs.px.reshape(-1, 4, 2)[:, [0, 1, 3, 2]].reshape(-1, 2), signs.count)
+    for lanes in (markers(), NONE):
+        assert kinds(rows, lanes) == ["crossed-corners"]
 
 
 def test_shares_of_the_image_are_named() -> None:

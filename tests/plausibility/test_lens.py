@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from worlds.mistakes import relensed, spoiled
 
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.plausibility.lens import LensLimits, MissingLens, lens_findings, missing_lens
+from crowdmap_torch.soak.spoiled import relensed, spoiled
 from crowdmap_torch.tables import Journey, Tracklets
 from crowdmap_torch.tracking.signs import associate_signs
 

@@ -66,3 +66,23 @@ def test_times_in_another_unit_are_named() -> None:
 def test_a_drive_at_the_height_of_its_origin_alone_is_not_enough() -> None:
     low = Origin(ORIGIN.lat_deg, ORIGIN.lon_deg, 0.4)
     assert pose_findings(drive(torch.zeros(60).double()), low) == []
+
+
+@pytest.mark.parametrize("heading_deg", range(-180, 180, 30))
+def test_axes_of_opengl_are_named(heading_deg: int) -> None:
+    journey = drive(torch.linspace(0, 0.5, 60).double() + math.radians(heading_deg))
+    over = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double())
+    turned = replace(journey, T_world_camera=journey.T_world_camera @ over)
+    assert kinds(turned) == ["camera-axes"]
+
+
+def test_a_drive_to_the_east_shows_another_order_of_quaternions_only_a_little() -> None:
+    journey = drive(0.25 * torch.sin(torch.arange(80).double() / 10))
+    T = journey.T_world_camera
+    x, y, z, w = se3.to_quaternion(T[:, :3, :3]).unbind(-1)
+    mixed = se3.make(se3.from_quaternion(torch.stack((w, x, y, z), dim=-1)), T[:, :3, 3])
+    (found,) = pose_findings(replace(journey, T_world_camera=mixed), ORIGIN)
+    assert found.kind == "quaternion-order"
+    # A camera that looks as far aside for good is none.
+    aside = se3.exp(torch.tensor([0, 0, 0, 0.1, 0.25, 0]).double())
+    assert kinds(replace(journey, T_world_camera=T @ aside)) == []

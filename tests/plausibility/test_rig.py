@@ -49,3 +49,12 @@ def test_intrinsics_of_a_smaller_image_are_named() -> None:
 def test_coefficients_in_another_order_are_named() -> None:
     camera = replace(RIG.camera, distortion=LENS[[0, 1, 4, 2, 3]] * 10)
     assert kinds(replace(RIG, camera=camera)) == ["coefficient-order"]
+
+
+@pytest.mark.parametrize("order", [[0, 2, 3, 1, 4], [2, 3, 0, 1, 4]])
+def test_the_order_of_coefficients_is_told_where_one_only_is_a_lens(order: list[int]) -> None:
+    camera = replace(RIG.camera, distortion=LENS[order])
+    (found,) = rig_findings(replace(RIG, camera=camera))
+    assert found.repair is not None
+    given = [float(LENS[order][round(k)]) for k in found.repair.numbers]
+    assert given == LENS.tolist()
