@@ -1,8 +1,9 @@
 """The command line: `crowdmap NAME [options]`, or `python -m crowdmap_torch NAME [options]`.
 
 Exit codes: 0 done; 2 the input or the configuration is wrong; 3 the map has no signs or no lanes though some were detected
-(`optimize --strict`); 1 anything else, such as a disk that is full; 130, 143 and 129 ended by SIGINT, SIGTERM and SIGHUP;
-141 done, but nobody read standard output to its end. Each but 0 and 141 is said in one line.
+(`optimize --strict`); 4 a dataset has what stops or spoils a map (`check`); 1 anything else, such as a disk that is full;
+130, 143 and 129 ended by SIGINT, SIGTERM and SIGHUP; 141 done, but nobody read standard output to its end. Each but 0 and
+141 is said in one line.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from crowdmap_torch.processes.streams import StandardStreams
 COMMANDS = {
     "optimize": "map a dataset",
     "simulate": "write a simulated dataset with exact ground truth",
+    "check": "say everything that is wrong with a dataset, and put right what can be",
     "convert": "bring drives in other formats into a dataset",
     "evaluate": "compare a map with a survey",
     "export": "write a map in a format of others",

@@ -28,7 +28,7 @@ FLOORS = (
     ("evaluation", "simulate"),
     ("adjustment", "viewer"),
     ("config", "plausibility"),
-    ("mapper", "single_journey"),
+    ("mapper", "single_journey", "checking"),
     ("report",),
     ("runs",),
     ("benchmark",),

@@ -1,0 +1,35 @@
+"""Data sets with mistakes, and what is said of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from crowdmap_torch.soak.spoiled import spoiled
+
+Spoil = Callable[[str], Path]
+
+
+@pytest.fixture
+def spoil(winding_folder: Path, tmp_path: Path) -> Spoil:
+    """A copy of a good data set with a mistake."""
+    return lambda mistake: spoiled(winding_folder, tmp_path / mistake, mistake)
+
+
+@pytest.fixture
+def set_values() -> Callable[[Path, str, dict[int, float]], None]:
+    """Writes values into rows of a column of a file."""
+
+    def change(path: Path, name: str, values: dict[int, float]) -> None:
+        table = pq.read_table(path)
+        column = table.column(name).to_numpy().copy()
+        column[np.array([*values])] = [*values.values()]
+        k = table.column_names.index(name)
+        pq.write_table(table.set_column(k, name, pa.array(column)), path)
+
+    return change
