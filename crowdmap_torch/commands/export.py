@@ -18,17 +18,21 @@ from crowdmap_torch.io.formats.exporters.export import (
     ExportFormat,
     export_map,
     export_run,
+    form_of,
+    names,
 )
 from crowdmap_torch.io.maps import read_map
-
-_ALL = FORMATS | TRAJECTORIES
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap export` takes."""
     parser.add_argument("map", type=Path, metavar="MAP", help="a map, a survey, or a RUN")
-    titles = "; ".join(f"{name}: {form.title}" for name, form in _ALL.items())
-    parser.add_argument("--to", required=True, choices=[*_ALL], metavar="FORMAT", help=titles)
+    titles = [f"{name}: {form.title}" for name, form in (FORMATS | TRAJECTORIES).items()]
+    titles += [f"{name}: of another package" for name in names() if name not in FORMATS]
+    choices = [*names(), *TRAJECTORIES]
+    parser.add_argument(
+        "--to", required=True, choices=choices, metavar="FORMAT", help="; ".join(titles)
+    )
     parser.add_argument(
         "-o", "--out", type=Path, metavar="FILE", help="default: beside MAP, named after it"
     )
@@ -37,10 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Writes the file, and prints what went into it and what did not."""
-    form = _ALL[options.to]
     if options.to in TRAJECTORIES:
-        _run_trajectories(options, form)
+        _run_trajectories(options, TRAJECTORIES[options.to])
         return
+    form = form_of(options.to)
     folder = _map_folder(options.map)
     out = options.out or folder.resolve().with_name(f"{folder.resolve().name}{form.ending}")
     _require_free(out, folder, form, options.overwrite)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from importlib.metadata import EntryPoint, entry_points
 
-from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.formats import importers
 from crowdmap_torch.io.formats.composing.parts import Importer
+from crowdmap_torch.io.formats.plugins import brought, loaded
 
 GROUP = "crowdmap_torch.importers"
 """Entry points with the name of a format lead to an `Importer`."""
@@ -18,7 +18,7 @@ OWN = tuple(module.name.replace("_", "-") for module in pkgutil.iter_modules(imp
 
 def names() -> tuple[str, ...]:
     """All formats, the package's own first."""
-    return (*OWN, *sorted({point.name for point in _others()} - set(OWN)))
+    return (*OWN, *sorted(brought(GROUP).keys() - set(OWN)))
 
 
 def find(name: str) -> Importer:
@@ -26,27 +26,6 @@ def find(name: str) -> Importer:
     if name in OWN:
         module = importlib.import_module(f"{importers.__name__}.{name.replace('-', '_')}")
         return module.IMPORTER
-    for point in _others():
-        if point.name == name:
-            return _loaded(point)
+    if name in (others := brought(GROUP)):
+        return loaded(others[name], Importer)
     raise InputError(f"format {name!r} is unknown; expected one of {', '.join(names())}")
-
-
-def _others() -> list[EntryPoint]:
-    return list(entry_points(group=GROUP))
-
-
-def _loaded(point: EntryPoint) -> Importer:
-    try:
-        importer = point.load()
-    except (ImportError, AttributeError) as error:
-        raise InputError(
-            f"format {point.name!r}: its entry point {point.value} cannot be loaded "
-            f"({one_line(error)}); install or remove the package that brings it"
-        ) from error
-    if not isinstance(importer, Importer):
-        raise InputError(
-            f"format {point.name!r}: its entry point {point.value} is a {type(importer).__name__}; "
-            f"expected a {Importer.__module__}.Importer"
-        )
-    return importer

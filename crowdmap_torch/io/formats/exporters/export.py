@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from crowdmap_torch.io.atomic import atomic_file, atomic_folder
 from crowdmap_torch.io.errors import InputError, needing
 from crowdmap_torch.io.formats.exporters.trajectories import write_kitti, write_tum
+from crowdmap_torch.io.formats.plugins import brought, loaded
 from crowdmap_torch.tables import HdMap
 
 
@@ -24,6 +26,20 @@ class ExportFormat:
     """Whether it is a folder of files."""
 
 
+@dataclass(frozen=True)
+class Exporter:
+    """A format that another package brings, by an entry point of the group `crowdmap_torch.exporters`."""
+
+    form: ExportFormat
+    write: Callable[[HdMap, Path], tuple[str, ...]]
+    """Writes a map to a path that is free (into a folder that is there), and returns what it left out, a line each.
+
+    OSError if it cannot be written; the path is beside the file's own, and renamed when it is whole.
+    """
+
+
+GROUP = "crowdmap_torch.exporters"
+"""Entry points with the name of a format lead to an `Exporter`."""
 FORMATS = {
     "geojson": ExportFormat("GeoJSON", ".geojson"),
     "lanelet2": ExportFormat("Lanelet2 (OSM)", ".osm"),
@@ -42,12 +58,29 @@ def export_map(hd_map: HdMap, path: Path, to: str) -> tuple[str, ...]:
     What was at `path` stays until the new file is complete. InputError for a format that nobody knows, or that needs
     an extra which is not installed; OSError if the file cannot be written.
     """
-    if to not in FORMATS:
-        raise InputError(f"format {to!r} is unknown; expected one of {', '.join(FORMATS)}")
+    form = form_of(to)
+    write = _own_writer(to) if to in FORMATS else loaded(brought(GROUP)[to], Exporter).write
+    with atomic_folder(path) if form.is_folder else atomic_file(path) as beside:
+        return write(hd_map, beside)
+
+
+def names() -> tuple[str, ...]:
+    """All formats of maps, the package's own first."""
+    return (*FORMATS, *sorted(brought(GROUP).keys() - FORMATS.keys() - TRAJECTORIES.keys()))
+
+
+def form_of(to: str) -> ExportFormat:
+    """A format of maps; InputError if nobody knows it, or if what brings it cannot be loaded."""
+    if to in FORMATS:
+        return FORMATS[to]
+    if to not in names():
+        raise InputError(f"format {to!r} is unknown; expected one of {', '.join(names())}")
+    return loaded(brought(GROUP)[to], Exporter).form
+
+
+def _own_writer(to: str) -> Callable[[HdMap, Path], tuple[str, ...]]:
     with needing(FORMATS[to].title, f"'crowdmap_torch[{FORMATS[to].extra}]'"):
-        module = importlib.import_module(f"{__package__}.{to}")
-    with atomic_folder(path) if FORMATS[to].is_folder else atomic_file(path) as beside:
-        return module.write(hd_map, beside)
+        return importlib.import_module(f"{__package__}.{to}").write
 
 
 TRAJECTORIES = {

@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from worlds.packages import Bring, bringing
 
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.formats.composing import registry
@@ -11,20 +12,8 @@ from crowdmap_torch.io.formats.composing.parts import Importer
 
 @pytest.fixture
 def bring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Installs a package with one entry point into the path of modules."""
-
-    def install(name: str, target: str, module: str) -> None:
-        (tmp_path / "their_formats.py").write_text(module)
-        info = tmp_path / "their_formats-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-formats\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{name} = {target}\n")
-        monkeypatch.syspath_prepend(tmp_path)
-
-    yield install
-    import sys
-
-    sys.modules.pop("their_formats", None)
+    with bringing(tmp_path, monkeypatch) as install:
+        yield install
 
 
 THEIRS = """
@@ -40,8 +29,8 @@ def test_every_format_of_the_package_has_an_importer():
         assert importer.tested_on in ("real files", "small files after the published layout")
 
 
-def test_other_packages_bring_formats(bring):
-    bring("their-log", "their_formats:IMPORTER", THEIRS)
+def test_other_packages_bring_formats(bring: Bring):
+    bring(registry.GROUP, "their-log", "their_formats:IMPORTER", THEIRS)
     assert registry.names()[-1] == "their-log"
     assert registry.find("their-log").summary == "theirs"
 
@@ -54,8 +43,8 @@ def test_other_packages_bring_formats(bring):
         ("their_formats:Parts", "is a type; expected a .*Importer"),
     ],
 )
-def test_formats_that_cannot_be_loaded_are_named(bring, target: str, expected: str):
-    bring("their-log", target, THEIRS)
+def test_formats_that_cannot_be_loaded_are_named(bring: Bring, target: str, expected: str):
+    bring(registry.GROUP, "their-log", target, THEIRS)
     with pytest.raises(InputError, match=f"format 'their-log': .*{expected}"):
         registry.find("their-log")
 
