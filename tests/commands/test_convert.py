@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -22,14 +23,20 @@ def test_the_tutorials_commands_lead_to_a_map(
     page = PAGE.read_text(encoding="utf-8")
     (table,) = re.findall(r"^```csv\n(.*?)^```", page, flags=re.M | re.S)
     monkeypatch.chdir(tmp_path)
+    figures = ""
     for line in re.findall(r"^\$ (.+)$", page, flags=re.M):
         name, *arguments = shlex.split(line)
         if name == "python":
             assert arguments[0] == "docs/examples/own_data.py"
             own_data.main(*map(Path, arguments[1:]))
             Path("FILES/names.csv").write_text(table)
+        elif "geopackage" in arguments and find_spec("pyogrio") is None:
+            continue
         else:
             assert name == "crowdmap" and main(arguments) == 0, capsys.readouterr().err
+            if arguments[0] == "evaluate":
+                figures = capsys.readouterr().out
+    assert Path("street.osm").stat().st_size > 10_000
     # Nothing was lost on the way: what was detected is what was simulated.
     made, simulated = load_dataset("DATA"), load_dataset("STREET")
     for one, other in zip(made.journeys, simulated.journeys, strict=True):
@@ -38,7 +45,7 @@ def test_the_tutorials_commands_lead_to_a_map(
         np.testing.assert_allclose(one.signs.corners_px, other.signs.corners_px, atol=1e-3)
         assert (one.signs.shape == other.signs.shape).all()
         assert len(one.lanes) == len(other.lanes)
-    figures = capsys.readouterr().out.rpartition("Signs")[2]
+    figures = figures.rpartition("Signs")[2]
     assert re.search(r"recall +100\.0 %\n +precision +100\.0 %", figures)
     assert re.search(r"pair precision +100\.0 %", figures)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.formats.exporters.features import layers
 from crowdmap_torch.io.formats.exporters.geojson import write
 from crowdmap_torch.io.formats.geodesy import local_from_geodetic
 from crowdmap_torch.tables import HdMap
@@ -78,3 +79,11 @@ def test_gdal_reads_every_feature(hd_map: HdMap, tmp_path: Path):
     told = pyogrio.read_info(tmp_path / "map.geojson")
     assert told["features"] == 2 * len(hd_map.signs) + len(hd_map.lanes)
     assert told["crs"] == "EPSG:4979" or told["crs"] == "EPSG:4326"
+    shapely = pytest.importorskip("shapely", reason="shapely (extra [gis]) is not installed")
+    _, _, shapes, _ = pyogrio.raw.read(tmp_path / "map.geojson")
+    every = [place for layer in layers(hd_map) for place in layer.place]
+    for shape, place in zip(shapely.from_wkb(shapes), every, strict=True):
+        found = shapely.get_coordinates(shape, include_z=True)[: len(place)]
+        # Outlines may run the other way round: 1e-8 degrees are a millimetre.
+        away = np.abs(found[:, None] - place[None]) / [1e-8, 1e-8, 1e-3]
+        assert away.max(axis=2).min(axis=1).max() < 1

@@ -4,6 +4,7 @@ import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import numpy as np
 import pytest
 from worlds.marked_roads import two_way_road
 
@@ -50,3 +51,18 @@ def test_a_document_says_where_it_comes_from(document: ET.Element):
 def test_heights_do_not_lift_what_is_drawn(document: ET.Element):
     modes = {mode.text for mode in document.iter(f"{{{KML['k']}}}altitudeMode")}
     assert modes == {"clampToGround"} and len(LAYERS) == 3
+
+
+def test_gdal_reads_every_feature_to_the_millimetre(tmp_path: Path):
+    raw = pytest.importorskip("pyogrio.raw", reason="pyogrio (extra [gis]) is not installed")
+    shapely = pytest.importorskip("shapely", reason="shapely (extra [gis]) is not installed")
+    road = two_way_road()
+    write(road, tmp_path / "road.kml")
+    for layer in layers(road):
+        _, _, shapes, _ = raw.read(tmp_path / "road.kml", layer=layer.name)
+        assert len(shapes) == len(layer.place)
+        for shape, place in zip(shapely.from_wkb(shapes), layer.place, strict=True):
+            found = shapely.get_coordinates(shape, include_z=True)[: len(place)]
+            # Outlines may run the other way round: 1e-8 degrees are a millimetre.
+            away = np.abs(found[:, None] - place[None]) / [1e-8, 1e-8, 1e-3]
+            assert away.max(axis=2).min(axis=1).max() < 1
