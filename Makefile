@@ -9,7 +9,7 @@ KILLS := 60
 SIGNALS := 10
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test soak test-coverage lint format
+.PHONY: help install demo test soak test-coverage lint format docs
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 16
@@ -51,3 +51,8 @@ lint: $(STAMP)  ## ruff and pyright
 format: $(STAMP)  ## format and sort imports
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# No link may lead nowhere. Needs no network.
+docs: $(STAMP)  ## the pages as a site, in site/
+	$(BIN)/python docs/configuration.py --write
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -q -d site

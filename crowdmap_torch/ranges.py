@@ -8,6 +8,8 @@ Python, is told in one line what is outside.
 from __future__ import annotations
 
 import argparse
+import ast
+import inspect
 import math
 import types
 import typing
@@ -117,6 +119,19 @@ class Settings:
 def hints(settings: type) -> dict[str, Any]:
     """The annotations of a class with their ranges."""
     return typing.get_type_hints(settings, include_extras=True)
+
+
+def field_texts(settings: type) -> dict[str, str]:
+    """The docstrings under the fields of a dataclass, on one line each."""
+    body = ast.parse(inspect.getsource(settings)).body[0]
+    assert isinstance(body, ast.ClassDef)
+    texts = {}
+    for field, text in zip(body.body, body.body[1:], strict=False):
+        if not isinstance(field, ast.AnnAssign) or not isinstance(field.target, ast.Name):
+            continue
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            texts[field.target.id] = " ".join(str(text.value.value).split())
+    return texts
 
 
 def argument(kind: Any) -> Callable[[str], Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import architecture
+import configuration
 import pytest
 import yaml
 
@@ -112,3 +113,17 @@ def test_each_of_the_papers_equations_has_its_test():
     tests = set(re.findall(r"^def (test_\w+)", "\n".join(map(text, sources)), flags=re.M))
     for what, *_, test in papers_equations():
         assert test.strip("`") in tests, what
+
+
+def test_the_reference_of_the_configuration_is_that_of_the_dataclasses():
+    assert text(configuration.PAGE) == configuration.page(), (
+        "docs/CONFIGURATION.md is out of date: run `python docs/configuration.py --write`"
+    )
+
+
+def test_every_key_of_the_configuration_has_a_text():
+    rows = re.findall(
+        r"^\| `(\w+)` \| `(.*?)` \| (.*?) \| (.*) \|$", configuration.page(), flags=re.M
+    )
+    assert len(rows) > 100
+    assert [name for name, _, _, meaning in rows if len(meaning) < 5] == []

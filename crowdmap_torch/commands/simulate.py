@@ -8,7 +8,6 @@ Every number of the presets is an option; `--help` lists them with their meaning
 from __future__ import annotations
 
 import argparse
-import ast
 import inspect
 import sys
 import time
@@ -22,7 +21,7 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.errors import input_read
 from crowdmap_torch.io.formats.composing.map_files import map_of_file
 from crowdmap_torch.io.maps import read_map
-from crowdmap_torch.ranges import Count, Factor, Seed, argument, hints
+from crowdmap_torch.ranges import Count, Factor, Seed, argument, field_texts, hints
 from crowdmap_torch.simulate.dataset import DETECTION_PRESETS, SimulationConfig, write_dataset
 from crowdmap_torch.simulate.errors import ALL, ERRORS, with_errors
 from crowdmap_torch.simulate.faults import KINDS
@@ -90,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replaces a dataset in OUT")
     for name, config in _GROUPS.items():
         group = parser.add_argument_group(name, inspect.getdoc(config))
-        kinds, texts = hints(config), _field_docstrings(config)
+        kinds, texts = hints(config), field_texts(config)
         for f in fields(config):
             if f.name == "name" or is_dataclass(kinds[f.name]):
                 continue
@@ -186,19 +185,6 @@ def _kind(hint: object) -> dict:
         kinds = typing.get_args(inside)
         return {"type": argument(kinds[0]), "nargs": len(kinds), "metavar": ("LEAST", "MOST")}
     return {"type": argument(hint), "metavar": "N"}
-
-
-def _field_docstrings(config: type) -> dict[str, str]:
-    """The docstrings under the fields of a dataclass."""
-    body = ast.parse(inspect.getsource(config)).body[0]
-    assert isinstance(body, ast.ClassDef)
-    texts = {}
-    for field, text in zip(body.body, body.body[1:], strict=False):
-        if not isinstance(field, ast.AnnAssign) or not isinstance(field.target, ast.Name):
-            continue
-        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-            texts[field.target.id] = " ".join(str(text.value.value).split())
-    return texts
 
 
 def _changed(config, options: argparse.Namespace, group: str, **changes):

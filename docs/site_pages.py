@@ -1,0 +1,42 @@
+"""What mkdocs needs beside mkdocs.yml: the pages of the repository's root, and links between them and those of docs/.
+
+Links to what is no page (sources, configurations) become plain text: the site stands by itself.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+FROM_ROOT = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """The files of docs/ and those of the root."""
+    from mkdocs.structure.files import File  # pyright: ignore[reportMissingImports]
+
+    for name in FROM_ROOT:
+        files.append(File.generated(config, name, content=(ROOT / name).read_text("utf-8")))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """A page with its links as the site has them."""
+    return with_links(markdown, page.file.src_uri, {file.src_uri for file in files})
+
+
+def with_links(markdown: str, name: str, known: set[str]) -> str:
+    """The text of page `name`: links between docs/ and the root lead to the `known` files, others are their text alone."""
+    folder = ROOT if name in FROM_ROOT else ROOT / "docs"
+
+    def there(match: re.Match[str]) -> str:
+        bang, text, target, anchor = match.groups(default="")
+        path, own = (folder / target).resolve(), ROOT / "docs"
+        inside = path.relative_to(own).as_posix() if path.is_relative_to(own) else path.name
+        if inside in known:
+            return f"{bang}[{text}]({inside}{anchor})"
+        return "" if bang else text
+
+    return re.sub(r"(!?)\[([^\]]*)\]\((?!https?:|#)([^)#\s]+)(#[^)\s]*)?\)", there, markdown)
