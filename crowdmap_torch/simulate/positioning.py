@@ -1,4 +1,4 @@
-"""The positioning module: true poses with a bias, a slow drift, white noise and outages; its own sigmas."""
+"""The positioning module: true poses with a bias that may wander, a drift, white noise and outages; its own sigmas."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from crowdmap_torch.geometry import se3
 from crowdmap_torch.ranges import (
     Degrees,
     Factor,
+    Length,
     LengthOrNone,
     Offset,
     Range,
@@ -24,6 +25,8 @@ from crowdmap_torch.ranges import (
 
 _DRIFT_STEP_M = 0.1
 """Way between the samples of a drift."""
+_WANDER_STEP_M = 10.0
+"""Way between the samples of a bias that wanders; linear in between."""
 _TAIL_STEP_M = 10.0
 """Way over which one draw of a heavy-tailed size holds."""
 _LARGEST_OUTAGE = 0.6
@@ -40,6 +43,11 @@ class PositioningConfig(Settings):
     """1-sigma of a journey's constant bias to the east."""
     bias_n_m: LengthOrNone = 0.30
     bias_u_m: LengthOrNone = 0.42
+    bias_wander_m: LengthOrNone = 0.0
+    """1-sigma of how far the bias wanders along a drive, east, north and up alike: an Ornstein-Uhlenbeck process beside the
+    constant; 0: it does not."""
+    bias_wander_length_m: Length = 3000.0
+    """Distance travelled over which its correlation falls to 1/e."""
     drift_m: LengthOrNone = 0.25
     """1-sigma of the Ornstein-Uhlenbeck drift of the position, east, north and up alike."""
     drift_length_m: LengthOrNone = 150.0
@@ -117,12 +125,34 @@ class Outage:
 
 
 @dataclass(frozen=True)
+class Wander:
+    """How a drive's bias wanders: its error beside the constant one."""
+
+    every_m: float
+    """Way travelled from one sample to the next, from the start on."""
+    away_m: tuple[tuple[float, float, float], ...]
+    """East, north, up at the samples; linear in between."""
+
+    def shift(self, distance: Float[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
+        """Error of the position at the frames [m]."""
+        away = np.array(self.away_m)
+        at = self.every_m * np.arange(len(away))
+        return np.stack([np.interp(distance, at, axis) for axis in away.T], axis=-1)
+
+
+@dataclass(frozen=True)
 class DriveErrors:
     """What is wrong with the positioning of one drive, and is not said."""
 
     sigma_factor: float
     """Stated sigmas are the true ones times this, and times `sigma_scale`."""
     outage: Outage | None
+    wander: Wander | None = None
+
+    def shift(self, distance: Float[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
+        """Error of the position at the frames [m], by way travelled."""
+        parts = [part.shift(distance) for part in (self.outage, self.wander) if part is not None]
+        return np.sum(parts, axis=0) if parts else np.zeros((len(distance), 3))
 
 
 def drive_errors(
@@ -142,7 +172,21 @@ def drive_errors(
         for part, e, n, u in zip((1.0, 0.5), east, north, up, strict=True)
     )
     outage = Outage(float(begin), float(begin + length), away, sway)
-    return DriveErrors(float(np.exp(log_factor)), outage if has_outage and size > 0 else None)
+    # Drawn last: the rest of a drive is the same with and without it.
+    wander = _wander(distance, config, rng) if config.bias_wander_m else None
+    return DriveErrors(
+        float(np.exp(log_factor)), outage if has_outage and size > 0 else None, wander
+    )
+
+
+def _wander(
+    distance: Float[np.ndarray, " f"], config: PositioningConfig, rng: np.random.Generator
+) -> Wander:
+    count = int(distance[-1] / _WANDER_STEP_M) + 2
+    away = config.bias_wander_m * _unit_process(
+        count, _WANDER_STEP_M / config.bias_wander_length_m, rng
+    )
+    return Wander(_WANDER_STEP_M, tuple((float(e), float(n), float(u)) for e, n, u in away))
 
 
 def pose_errors(
@@ -183,7 +227,7 @@ def reported_sigmas(
         return None
     bias = np.array([config.bias_e_m, config.bias_n_m, config.bias_u_m])
     white = np.array([config.white_e_m, config.white_n_m, config.white_u_m])
-    position = np.sqrt(bias**2 + config.drift_m**2 + white**2)
+    position = np.sqrt(bias**2 + config.bias_wander_m**2 + config.drift_m**2 + white**2)
     rotation = np.radians(np.hypot(config.drift_rot_deg, config.white_rot_deg))
     factor = config.sigma_scale * (1.0 if errors is None else errors.sigma_factor)
     return factor * position, float(factor * rotation)
@@ -199,13 +243,20 @@ def _drift(
     if config.drift_smooth_m or config.drift_freedom:
         return _smooth_drift(distance, length, config, rng)
     samples = int(distance[-1] / _DRIFT_STEP_M) + 2
-    keep = np.exp(-_DRIFT_STEP_M / length)
+    process = _unit_process(samples, _DRIFT_STEP_M / length, rng)
+    return process[np.rint(distance / _DRIFT_STEP_M).astype(np.int64)]
+
+
+def _unit_process(
+    samples: int, step: float, rng: np.random.Generator
+) -> Float[np.ndarray, "samples 3"]:
+    """Its samples, `step` correlation lengths apart."""
+    keep = np.exp(-step)
     push = rng.normal(size=(samples, 3)) * np.sqrt(1 - keep**2)
     push[0] /= np.sqrt(
         1 - keep**2
     )  # the first sample has the full variance: stationary from the start
-    process = lfilter([1.0], [1.0, -keep], push, axis=0)
-    return np.asarray(process)[np.rint(distance / _DRIFT_STEP_M).astype(np.int64)]
+    return np.asarray(lfilter([1.0], [1.0, -keep], push, axis=0))
 
 
 def _smooth_drift(

@@ -175,3 +175,31 @@ def test_stated_sigmas_are_off_by_a_factor_either_way():
     off, off_turn = reported_sigmas(config, drawn[0])  # type: ignore[misc]
     np.testing.assert_allclose(off, drawn[0].sigma_factor * position)
     assert off_turn == pytest.approx(drawn[0].sigma_factor * turn)
+
+
+def test_a_bias_that_wanders_has_its_sigma_and_forgets_itself_over_its_length():
+    config = replace(PAPER, bias_wander_m=1.0)
+    distance = np.array([0.0, 3000.0, 20000.0])
+    drawn = [drive_errors(distance, config, np.random.default_rng(k)).wander for k in range(600)]
+    away = np.array([wander.shift(distance) for wander in drawn if wander is not None])
+    assert len(away) == 600
+    # Of 1,800 numbers a standard deviation is known to 2 %, a correlation to 0.03.
+    np.testing.assert_allclose(away.std((0, 2)), 1.0, rtol=0.08)
+    np.testing.assert_allclose((away[:, 0] * away[:, 1]).mean(), np.exp(-1), atol=0.1)
+    np.testing.assert_allclose((away[:, 0] * away[:, 2]).mean(), 0.0, atol=0.1)
+    position, _ = reported_sigmas(config)  # type: ignore[misc]
+    plain, _ = reported_sigmas(PAPER)  # type: ignore[misc]
+    np.testing.assert_allclose(position**2, plain**2 + 1.0)
+
+
+def test_what_else_is_drawn_of_a_drive_does_not_depend_on_whether_its_bias_wanders():
+    config = replace(PAPER, outages=1.0, sigma_spread=1.5)
+    distance = np.array([0.0, 2500.0])
+    still, wandering = (
+        drive_errors(distance, c, np.random.default_rng(4))
+        for c in (config, replace(config, bias_wander_m=1.0))
+    )
+    assert still.wander is None and replace(wandering, wander=None) == still
+    assert still.outage is not None and wandering.wander is not None
+    both = wandering.shift(distance) - still.shift(distance)
+    np.testing.assert_allclose(both, wandering.wander.shift(distance))
