@@ -121,7 +121,7 @@ class MapResult:
     """Refined camera poses."""
     uncertainty: MapUncertainty
     """Of the signs and lanes of the map, tentative signs left out, and of the journeys' errors."""
-    prior_scale: Float[Tensor, "j 3"]
+    prior_scale: Float[Tensor, "j _"]
     """By journey, how far the sigmas of its bias, drift and rotation were from those given."""
     white_scale: Float[Tensor, "j 2"]
     """The same of the noise from frame to frame, of positions and of rotations."""

@@ -96,9 +96,12 @@ def build(
     frame = torch.nonzero(kept)[:, 0]
     nodes = _nodes(journeys, frame, config)
     at_nodes = drift[frame][nodes.first]
+    poses = pose_prior(
+        journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior
+    )
     values = {
         "pose": start[frame],
-        "drift": at_nodes,
+        "drift": poses.with_wander(at_nodes),
         "bias": nodes.mean(at_nodes, len(journeys)),
         "sign": signs.T_world_sign,
         "size": signs.size,
@@ -108,9 +111,6 @@ def build(
     of_frame = nodes.journey[nodes.of_frame]
     fleet = fleet_of(journeys, frame, of_frame, unknown, known_cars or {})
     values |= {name: fleet.expected[name] for name in fleet.variables}
-    poses = pose_prior(
-        journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior
-    )
     fixed = _fixed_terms(values, signs, lanes, observed.corners, control, config)
     priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet)
     return Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
@@ -370,7 +370,7 @@ def read_poses(bundle: Bundle, journeys: Sequence[Journey]) -> tuple[Float[Tenso
             poses.append(journey.T_world_camera)
             continue
         of_journey = torch.nonzero(nodes.journey == number)[:, 0]
-        known, drift = nodes.way[of_journey], values["drift"][of_journey]
+        known, drift = nodes.way[of_journey], values["drift"][of_journey, :6]
         way = station(journey.T_world_camera)
         after = torch.searchsorted(known, way).clamp(1, max(len(known) - 1, 1))
         after = after.clamp_max(len(known) - 1)

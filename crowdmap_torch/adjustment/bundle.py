@@ -97,7 +97,7 @@ class Bundle(nn.Module):
     given_up: Tensor
     """Detections, by number, that have no say."""
     prior_scale: Tensor
-    """By journey, how far bias, drift and rotation are from the sigmas of `prior`."""
+    """By journey, how far bias, drift, rotation and the bias's wander, if any, are from the sigmas of `prior`."""
     white_scale: Tensor
     """By journey, how far the noise of positions and of rotations from frame to frame is from that of `prior`."""
     drift_told: Tensor
@@ -114,6 +114,8 @@ class Bundle(nn.Module):
             for name in self.fleet.variables
         }
         self.variables = VARIABLES | own
+        wide = values["drift"].shape[1]
+        self.variables["drift"] = replace(VARIABLES["drift"], tangent_dim=wide)
         self.names = tuple(values)
         for name, value in values.items():
             self.register_buffer(f"base_{name}", value.clone())
@@ -126,9 +128,11 @@ class Bundle(nn.Module):
         given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
         self.register_buffer("given_up", given_up)
         self.register_buffer("judged", torch.zeros_like(given_up, dtype=torch.long).sum())
-        self.register_buffer("prior_scale", torch.ones_like(values["bias"][:, :3]))
+        self.register_buffer(
+            "prior_scale", values["bias"].new_ones(len(values["bias"]), priors.poses.scale_count)
+        )
         self.register_buffer("white_scale", torch.ones_like(values["bias"][:, :2]))
-        self.register_buffer("drift_told", torch.ones_like(values["bias"]))
+        self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points
         self.lenses = observations.lenses
@@ -330,7 +334,7 @@ class Bundle(nn.Module):
         """
         return self._problem({**self._terms(self.prior_scale), **self._slide_term()})
 
-    def information(self, prior_scale: Float[Tensor, "j 3"]) -> Problem:
+    def information(self, prior_scale: Float[Tensor, "j _"]) -> Problem:
         """The problem whose Hessian tells what is known: nothing held, `prior_scale` for that of the bundle.
 
         The weights of detections are raised to what they keep of the information.
@@ -350,7 +354,7 @@ class Bundle(nn.Module):
             terms = {name: term.by_autograd() for name, term in terms.items()}
         return Problem(self.variables, terms)
 
-    def _terms(self, prior_scale: Float[Tensor, "j 3"]) -> dict[str, CostTerm]:
+    def _terms(self, prior_scale: Float[Tensor, "j _"]) -> dict[str, CostTerm]:
         if not bool(self.refreshed):
             self.refresh()
         terms = {

@@ -54,12 +54,14 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
     covariance = bundle.backend().assemble(bundle.information(expected), values).covariance()
     to_bias = _to_bias(values["pose"][nodes.first])
     count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)
-    of_bias = covariance.of_chain_sums(to_bias.mT / count[nodes.journey, None, None])
+    of_mean = to_bias.new_zeros(len(to_bias), bundle.prior.numbers, 4)
+    of_mean[:, :6] = to_bias.mT / count[nodes.journey, None, None]
+    of_bias = covariance.of_chain_sums(of_mean)
     every = torch.arange(len(signs), device=count.device)
     sign = LinearFunctions.of_tangents((("sign", every), ("size", every)), to_bias, 6, 2)
     of_sign = covariance.of(sign)
     shared = _shared(covariance, values, to_bias)
-    bias = (to_bias @ values["drift"][..., None])[..., 0]
+    bias = (to_bias @ values["drift"][:, :6, None])[..., 0]
     bias = nodes.mean(bias, journeys)
     silent = count == 0
     return MapUncertainty(

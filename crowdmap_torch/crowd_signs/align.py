@@ -14,6 +14,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_median, group_sum
 from crowdmap_torch.crowd_signs.distance import mahalanobis
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.band_cholesky import cholesky_banded
 from crowdmap_torch.optim.robust import Tukey
@@ -24,6 +25,8 @@ METHODS = ("robust", "paper2017")
 
 _CHI_SQUARE_MEDIAN = 2.366
 """Median squared length of a three-dimensional standard normal vector."""
+_AT_REST_M = 1e-4
+"""How far the bias of a drive wanders that is too short for it [m]."""
 _STANDS_STILL_M = 1e-3
 """Alternation ends when no bias moves by more [m]."""
 
@@ -55,7 +58,8 @@ class JourneyBias:
     """What each journey's poses have wrong, measured place minus true place, up to what all journeys share.
 
     At a place of a journey it is `translation + heading x (place - centroid) + drift(station)`. The station is the
-    distance driven; the drift is linear between nodes, which are equally spaced, and constant outside them.
+    distance driven; the drift is linear between nodes, which are equally spaced, and constant outside them. On long drives
+    part of it is how the bias wanders.
     """
 
     translation: Float[Tensor, "j 3"]
@@ -78,6 +82,8 @@ class JourneyBias:
     """Distance between nodes [m]."""
     node_drift: Float[Tensor, "k 3"]
     """Drift at the nodes [m]."""
+    node_wander: Float[Tensor, "k 3"]
+    """What of it is the bias's that wanders [m]; zero on drives that are too short for it."""
 
     def __len__(self) -> int:
         return len(self.heading)
@@ -87,6 +93,18 @@ class JourneyBias:
         """The journey that each node is on."""
         journey = torch.arange(len(self), device=self.node_count.device)
         return torch.repeat_interleave(journey, self.node_count)
+
+    @property
+    def node_station(self) -> Float[Tensor, " k"]:
+        """Distance driven at each node [m]."""
+        owner = self.journey_of_node
+        rank = torch.arange(len(owner), device=owner.device) - self.node_start[owner]
+        return self.node_origin[owner] + rank * self.node_spacing[owner]
+
+    @property
+    def length(self) -> Float[Tensor, " j"]:
+        """Way from the first to the last node of each journey [m]."""
+        return self.node_spacing * (self.node_count - 1)
 
 
 def no_bias(
@@ -117,6 +135,7 @@ def no_bias(
         node_origin=low,
         node_spacing=length / (count - 1),
         node_drift=station.new_zeros(int(count.sum()), 3),
+        node_wander=station.new_zeros(int(count.sum()), 3),
     )
 
 
@@ -134,8 +153,8 @@ def bias_at(
 
 
 def largest_drift(bias: JourneyBias) -> Float[Tensor, " j"]:
-    """Length of the largest drift along each journey [m]."""
-    length = bias.node_drift.norm(dim=1)
+    """Length of the largest drift along each journey, about its bias wherever that wanders [m]."""
+    length = (bias.node_drift - bias.node_wander).norm(dim=1)
     return length.new_zeros(len(bias)).scatter_reduce(0, bias.journey_of_node, length, "amax")
 
 
@@ -271,8 +290,9 @@ def _bias_given_places(
 ) -> JourneyBias:
     """Translation, heading and drift of all journeys at once, the places of the clusters given.
 
-    The drift's nodes form a chain in each journey. They are eliminated by one banded solve over the nodes of all
-    journeys (no entry couples two journeys); four unknowns a journey remain.
+    The drift's nodes form a chain in each journey, with how the bias wanders beside the drift where there is a long one.
+    They are eliminated by one banded solve over the nodes of all journeys (no entry couples two journeys); four unknowns a
+    journey remain.
     """
     J, K = len(bias), len(bias.node_drift)
     journey = members.journey
@@ -283,62 +303,86 @@ def _bias_given_places(
     B = torch.cat((eye, lever[..., None], (measured - place)[..., None]), dim=2)  # [n, 3, 4 + 1]
     WB = information @ B
 
-    diagonal, below = _drift_prior(bias, positioning)
-    a = along[:, None, None]
-    diagonal = diagonal.index_add(0, node, (1 - a).square() * information)
-    diagonal = diagonal.index_add(0, node + 1, a.square() * information)
-    below = below.index_add(0, node, a * (1 - a) * information)
-    right = WB.new_zeros(K, 3, 5).index_add(0, node, (1 - a) * WB).index_add(0, node + 1, a * WB)
+    diagonal, below = _node_prior(bias, bias_sigma, positioning)
+    parts = diagonal.shape[1] // 3
+    # Whatever a node's state consists of, what is seen is its sum.
+    of_sum = information.repeat(1, parts, parts)
+    a, WB_sum = along[:, None, None], WB.repeat(1, parts, 1)
+    diagonal = diagonal.index_add(0, node, (1 - a).square() * of_sum)
+    diagonal = diagonal.index_add(0, node + 1, a.square() * of_sum)
+    below = below.index_add(0, node, a * (1 - a) * of_sum)
+    right = WB.new_zeros(K, 3 * parts, 5).index_add(0, node, (1 - a) * WB_sum)
+    right = right.index_add(0, node + 1, a * WB_sum)
     solved = _solve_chain(diagonal, below, right)
 
     owner = bias.journey_of_node
     border = B[..., :4].mT @ WB
     schur = WB.new_zeros(J, 4, 5).index_add(0, journey, border)
     schur = schur.index_add(0, owner, -right[..., :4].mT @ solved)
-    heading_sigma = torch.full_like(bias_sigma[:, :1], positioning.bias_sigma_rad)
+    # What turns with the car leaves no mark on where it is kilometres ahead.
+    short = (LEAST_SHARE * positioning.wander_length_m / bias.length).clamp_max(1)
+    heading_sigma = positioning.bias_sigma_rad * short[:, None]
     prior = torch.diag_embed(torch.cat((bias_sigma, heading_sigma), dim=1).pow(-2))
     inverse = torch.linalg.inv(schur[..., :4] + prior)
     constant = (inverse @ schur[..., 4:])[..., 0]
     drift = solved[..., 4] - (solved[..., :4] @ constant[owner, :, None])[..., 0]
+    drift, *wander = drift.split(3, dim=1)
+    node_wander = wander[0] if wander else torch.zeros_like(drift)
     return replace(
         bias,
         translation=constant[:, :3],
         heading=constant[:, 3],
         covariance=inverse[:, :3, :3],
-        node_drift=drift,
+        node_drift=drift + node_wander,
+        node_wander=node_wander,
     )
 
 
-def _drift_prior(
-    bias: JourneyBias, positioning: PositioningNoise
-) -> tuple[Float[Tensor, "k 3 3"], Float[Tensor, "k 3 3"]]:
-    """Information of an Ornstein-Uhlenbeck chain: diagonal blocks, and those between a node and the next."""
+def _node_prior(
+    bias: JourneyBias, bias_sigma: Float[Tensor, "j 3"], positioning: PositioningNoise
+) -> tuple[Float[Tensor, "k s s"], Float[Tensor, "k s s"]]:
+    """Information of the nodes' states: diagonal blocks, and those between a node and the next."""
+    drift = torch.full_like(bias_sigma, positioning.drift_sigma_m)
+    chains = [_chain_prior(bias, drift, positioning.drift_length_m)]
+    is_long = bias.length >= LEAST_SHARE * positioning.wander_length_m
+    if positioning.wander_sigma_m and bool(is_long.any()):
+        # By how much it wanders shows in the adjustment: of what is known of the bias all but little may.
+        sigma = torch.where(is_long[:, None], WANDER_SHARE**0.5 * bias_sigma, _AT_REST_M)
+        chains.append(_chain_prior(bias, sigma, positioning.wander_length_m))
+    diagonal, between = (torch.cat(part, dim=1) for part in zip(*chains, strict=True))
+    return torch.diag_embed(diagonal), torch.diag_embed(between)
+
+
+def _chain_prior(
+    bias: JourneyBias, sigma: Float[Tensor, "j 3"], length_m: float
+) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
+    """Information of an Ornstein-Uhlenbeck chain by axis: of every node, and between it and the next."""
     owner = bias.journey_of_node
-    decay = torch.exp(-bias.node_spacing / positioning.drift_length_m)[owner]
-    step = 1 / (positioning.drift_sigma_m**2 * (1 - decay.square()))
+    decay = torch.exp(-bias.node_spacing / length_m)[owner, None]
+    variance = sigma[owner].square()
+    step = 1 / (variance * (1 - decay.square()))
     rank = torch.arange(len(owner), device=owner.device) - bias.node_start[owner]
-    is_first, is_last = rank == 0, rank == bias.node_count[owner] - 1
+    is_first = (rank == 0)[:, None]
+    is_last = (rank == bias.node_count[owner] - 1)[:, None]
     # A chain without its first step is stationary: sigma^-2 at the first node, decay^2 more where a step leaves a node.
-    into = torch.where(is_first, torch.full_like(step, positioning.drift_sigma_m**-2), step)
+    into = torch.where(is_first, 1 / variance, step)
     out = torch.where(is_last, 0.0, decay.square() * step)
-    eye = torch.eye(3).to(decay)
-    between = torch.where(is_last, 0.0, -decay * step)
-    return (into + out)[:, None, None] * eye, between[:, None, None] * eye
+    return into + out, torch.where(is_last, 0.0, -decay * step)
 
 
 def _solve_chain(
-    diagonal: Float[Tensor, "k 3 3"], below: Float[Tensor, "k 3 3"], right: Float[Tensor, "k 3 m"]
-) -> Float[Tensor, "k 3 m"]:
+    diagonal: Float[Tensor, "k s s"], below: Float[Tensor, "k s s"], right: Float[Tensor, "k s m"]
+) -> Float[Tensor, "k s m"]:
     """Solution of a symmetric block-tridiagonal system; `below[k]` couples k and k + 1 and is symmetric."""
-    K = len(diagonal)
-    lower = diagonal.new_zeros(K, 3, 6)
-    for column in range(3):
-        lower[:, column, : 3 - column] = diagonal[:, column:, column]
-        lower[:, column, 3 - column : 6 - column] = below[:, :, column]
-    factor = cholesky_banded(lower.view(3 * K, 6))
+    K, s = diagonal.shape[:2]
+    lower = diagonal.new_zeros(K, s, 2 * s)
+    for column in range(s):
+        lower[:, column, : s - column] = diagonal[:, column:, column]
+        lower[:, column, s - column : 2 * s - column] = below[:, :, column]
+    factor = cholesky_banded(lower.view(s * K, 2 * s))
     if factor is None:
         raise ArithmeticError("a chain of biases without a prior")
-    return factor.solve(right.reshape(3 * K, -1)).reshape(right.shape)
+    return factor.solve(right.reshape(s * K, -1)).reshape(right.shape)
 
 
 def _node_at(

@@ -61,7 +61,8 @@ from crowdmap_torch.crowd_signs.outlier_journeys import (
     journey_statistics,
 )
 from crowdmap_torch.crowd_signs.rounds import CrowdRound, crowd_round
-from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
+from crowdmap_torch.crowd_signs.stretches import vote_by_stretch
+from crowdmap_torch.crowd_signs.vote import VoteConfig
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.ranges import FILLED, Count, Rounds, Settings, Share, Sigma, Spacing
 from crowdmap_torch.tables import Signs
@@ -228,11 +229,8 @@ def _register_joint(
     generator: torch.Generator,
 ) -> Crowd:
     signs, journeys = crowd.signs, crowd.journeys
-    translation = vote_biases(
-        signs, config.vote, journeys=journeys, bias_sigma=crowd.bias_sigma, generator=generator
-    )
-    bias = no_bias(signs, crowd.station, positioning, config.align, journeys=journeys)
-    bias = replace(bias, translation=translation)
+    start = no_bias(signs, crowd.station, positioning, config.align, journeys=journeys)
+    bias = vote_by_stretch(crowd, start, positioning, config.vote, generator=generator)
     weight = crowd.bias_sigma.new_ones(journeys)
     label = torch.full_like(signs.journey, -1)
     rounds: list[CrowdRound] = []

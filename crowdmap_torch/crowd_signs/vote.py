@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.linalg import cg
 from torch import Tensor
@@ -52,12 +52,15 @@ def vote_biases(
     journeys: int,
     bias_sigma: Float[Tensor, "j 3"],
     generator: torch.Generator | None = None,
+    follows: Int[Tensor, " f"] | None = None,
+    steps: Float[Tensor, " f"] | None = None,
 ) -> Float[Tensor, "j 3"]:
     """First translation biases [m] of `journeys` journeys from the pattern of the signs around.
 
     Every pair of similar signs of two journeys votes for the shift between the two; signs one post apart vote for wrong
     shifts, but only the right one is the same at every post. The biases are the robust solution of all shifts; their
-    mean, weighted by the priors, is zero where journeys are connected.
+    mean, weighted by the priors, is zero where journeys are connected. Journeys that `follows` names are not far off the
+    next one's bias, by `steps` [m], 1-sigma.
     """
     pair = _partners(signs, config, journeys, generator)
     edge, i, k = _candidates(signs, pair, config, journeys, generator)
@@ -73,7 +76,13 @@ def vote_biases(
     clear = (1 - found.runner_up / found.support.clamp_min(1e-12)).clamp(0.05, 1)
     weight = clear * found.support / (1 + found.support)
     weight = torch.where(found.support > 0.3, weight, 0.0)
-    return _synchronise(pair, found.vector, weight, bias_sigma, config)
+    if follows is None or steps is None:
+        follows, steps = pair.new_zeros(0), bias_sigma.new_zeros(0)
+    held = (config.width_m / steps).square()
+    pair = torch.cat((pair, torch.stack((follows, follows + 1), dim=1)))
+    shift = torch.cat((found.vector, held.new_zeros(len(held), 3)))
+    votes = torch.arange(len(pair), device=pair.device) < len(weight)
+    return _synchronise(pair, shift, torch.cat((weight, held)), votes, bias_sigma, config)
 
 
 def _partners(
@@ -169,13 +178,15 @@ def _synchronise(
     pair: Int[Tensor, "e 2"],
     shift: Float[Tensor, "e 3"],
     weight: Float[Tensor, " e"],
+    votes: Bool[Tensor, " e"],
     bias_sigma: Float[Tensor, "j 3"],
     config: VoteConfig,
 ) -> Float[Tensor, "j 3"]:
-    """Biases whose differences are the shifts: least absolute deviations first, then wrong shifts have no say."""
+    """Biases whose differences are the shifts: least absolute deviations first, then wrong `votes` have no say."""
     J = len(bias_sigma)
     i, j = pair.cpu().numpy().T
     measured, trust = shift.detach().cpu().numpy(), weight.detach().cpu().numpy()
+    is_vote = votes.cpu().numpy()
     ridge = bias_sigma.detach().cpu().numpy() ** -2.0
     bias = np.zeros((J, 3))
     robust = np.ones(len(i))
@@ -200,4 +211,5 @@ def _synchronise(
             robust = config.width_m / np.maximum(miss, config.width_m)
         else:
             robust = np.clip(1 - (miss / config.outlier_m) ** 2, 0, None) ** 2
+        robust[~is_vote] = 1
     return torch.from_numpy(bias).to(bias_sigma)

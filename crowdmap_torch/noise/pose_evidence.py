@@ -10,10 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.noise.pose_prior import MOST_SCALE, PosePrior
+from crowdmap_torch.noise.pooled_scales import MOST_SCALE
+from crowdmap_torch.noise.pose_prior import PosePrior
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges, MapEquations
 
 _SAMPLED = 8
@@ -28,56 +29,88 @@ _WHITE_SCALES = (1.0, MOST_SCALE)
 class PoseEvidence:
     """What the observations of a bundle tell of its poses' errors, the landmarks known."""
 
-    told: Float[Tensor, "j 6"]
-    """By journey and number of a pose, the share of the drift's changes that observations tell."""
+    told: Float[Tensor, "j k"]
+    """By journey and number of a pose, the share of the drift's changes that observations tell; behind them, where the
+    bias wanders, those of its wander."""
     left: Float[Tensor, "p 6"]
     """Variance that is left of every pose's deviation from its drift."""
 
 
 def pose_evidence(
-    prior: PosePrior, equations: MapEquations, scale: Float[Tensor, "j 3"]
+    prior: PosePrior, equations: MapEquations, scale: Float[Tensor, "j _"]
 ) -> PoseEvidence:
     """That at the point of normal equations, which have been solved, with the prior's scales that they were made with."""
-    changes = sampled_changes(prior)
-    told = torch.ones_like(prior.bias_sigma)
+    told = prior.bias_sigma.new_ones(len(scale), prior.numbers)
+    changes = sampled_changes(prior, prior.far, prior.about_bias(_numbers(prior)))
     if len(changes.pair):
-        told = share_told(prior, changes, equations.variance_of_changes(changes), scale)
+        told[:, :6] = share_told(prior, changes, equations.variance_of_changes(changes), scale)
+    if prior.wander is not None:
+        changes = sampled_changes(prior, prior.wander.far, _numbers(prior)[:, 6:])
+        told[:, 6:] = _wander_told(prior, changes, equations.variance_of_changes(changes), scale)
     return PoseEvidence(told, equations.variance_of_leaves())
 
 
-def sampled_changes(prior: PosePrior) -> ChainChanges:
+def _numbers(prior: PosePrior) -> Float[Tensor, "k k"]:
+    """Each of a node's numbers by itself."""
+    return torch.eye(prior.numbers).to(prior.bias_sigma)
+
+
+def sampled_changes(
+    prior: PosePrior, pair: Int[Tensor, "q 2"], of: Float[Tensor, "k m"]
+) -> ChainChanges:
     """Some of the changes that scales are told by, spread over each journey: as many as are solved for at once."""
-    journey = prior.nodes.journey[prior.far[:, 0]]
-    _, of, count = torch.unique_consecutive(journey, return_inverse=True, return_counts=True)
-    rank = torch.arange(len(of), device=of.device) - (count.cumsum(0) - count)[of]
-    column = torch.where(count[of] > _SAMPLED, rank * _SAMPLED // count[of], rank)
+    journey = prior.nodes.journey[pair[:, 0]]
+    _, group, count = torch.unique_consecutive(journey, return_inverse=True, return_counts=True)
+    rank = torch.arange(len(group), device=group.device) - (count.cumsum(0) - count)[group]
+    column = torch.where(count[group] > _SAMPLED, rank * _SAMPLED // count[group], rank)
     starts = torch.ones_like(column, dtype=torch.bool)
-    starts[1:] = (column[1:] != column[:-1]) | (of[1:] != of[:-1])
-    return ChainChanges(prior.far[starts], column[starts])
+    starts[1:] = (column[1:] != column[:-1]) | (group[1:] != group[:-1])
+    return ChainChanges(pair[starts], column[starts], of)
 
 
 def share_told(
     prior: PosePrior,
     changes: ChainChanges,
     variance: Float[Tensor, "q 6"],
-    scale: Float[Tensor, "j 3"],
+    scale: Float[Tensor, "j _"],
 ) -> Float[Tensor, "j 6"]:
     """By journey and number of a pose, the share of changes that observations tell, not the prior at this `scale`.
 
     `variance` is what is left of each change: of one that nothing tells of, the prior's own.
     """
     journey = prior.nodes.journey[changes.pair[:, 0]]
-    of_each = scale[:, 1:].repeat_interleave(3, dim=1)[journey].square()
+    of_each = scale[:, 1:3].repeat_interleave(3, dim=1)[journey].square()
     share = 1 - variance / (of_each * prior.expected_changes(changes.pair))
-    total = share.new_zeros(len(scale), 6).index_add_(0, journey, share.clamp(0, 1))
-    return total / torch.bincount(journey, minlength=len(scale)).clamp_min(1)[:, None]
+    return _by_journey(share.clamp(0, 1), journey, len(scale))
+
+
+def _wander_told(
+    prior: PosePrior,
+    changes: ChainChanges,
+    variance: Float[Tensor, "q 3"],
+    scale: Float[Tensor, "j 4"],
+) -> Float[Tensor, "j 3"]:
+    """The same of the changes of a bias that wanders."""
+    assert prior.wander is not None
+    journey = prior.nodes.journey[changes.pair[:, 0]]
+    expected = prior.wander.expected_changes(changes.pair, prior.nodes.way, prior.nodes.journey)
+    share = 1 - variance / (scale[journey, 3:].square() * expected)
+    return _by_journey(share.clamp(0, 1), journey, len(scale))
+
+
+def _by_journey(
+    share: Float[Tensor, "q m"], journey: Int[Tensor, " q"], journeys: int
+) -> Float[Tensor, "j m"]:
+    """The mean of each journey's; zero where it has none."""
+    total = share.new_zeros(journeys, share.shape[1]).index_add_(0, journey, share)
+    return total / torch.bincount(journey, minlength=journeys).clamp_min(1)[:, None]
 
 
 def white_scales(
     prior: PosePrior,
     residual: Float[Tensor, "p 6"],
     left: Float[Tensor, "p 6"],
-    scale: Float[Tensor, "j 3"],
+    scale: Float[Tensor, "j _"],
     white_scale: Float[Tensor, "j 2"],
 ) -> Float[Tensor, "j 2"]:
     """By journey, what the noise of positions and of rotations from frame to frame is to be multiplied by.

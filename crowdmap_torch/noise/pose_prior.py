@@ -1,14 +1,14 @@
 """What the positioning module gets wrong, as a prior of bundle adjustment (V-B, footnote).
 
-The error of a journey's poses is a constant bias, a slow drift on top of it, a Gauss-Markov chain along the way, and
-white noise from frame to frame. `drift` is the error without the noise, at nodes a few metres apart: it is drawn towards
-the journey's `bias`, and the bias towards zero. The sigmas are the module's own where it gives them; how far each journey
-is from them shows when many have seen the same.
+The error of a journey's poses is a bias, a slow drift on top of it, a Gauss-Markov chain along the way, and white noise
+from frame to frame. `drift` is the error without the noise, at nodes a few metres apart: it is drawn towards the
+journey's `bias`, and the bias towards zero. Where one drive is so long that its bias wanders (`bias_wander`), `drift` has
+three numbers more: how far the bias is from the constant one at the node. The sigmas are the module's own where it gives
+them; how far each journey is from them shows when many have seen the same.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,12 +16,23 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.noise.bias_wander import (
+    WANDER_SHARE,
+    BiasWander,
+    bias_wander,
+    first_wander,
+    long_drives,
+    nodes_apart,
+)
+from crowdmap_torch.noise.pooled_scales import pooled
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
 from crowdmap_torch.tables import Journey
 
+_SWEEPS = 60
+"""Alternations between scales and what all journeys share."""
 LEAST_SIGMA_M = 1e-3
 """What carrier phases leave under the open sky of a receiver that stands still: who states less states nothing."""
 LEAST_SIGMA_RAD = 1e-5
@@ -94,9 +105,34 @@ class PosePrior:
     config: PosePriorConfig
     slots: dict[str, tuple[tuple[str, Tensor], ...]]
     """What each term touches."""
+    wander: BiasWander | None = None
+    """How the bias wanders; None: there is no drive that is long enough."""
+
+    @property
+    def scale_count(self) -> int:
+        """Scales of each journey: of its bias, of its drift, of its rotation, and of its wander where there is one."""
+        return 3 if self.wander is None else 4
+
+    @property
+    def numbers(self) -> int:
+        """Numbers of the drift at a node."""
+        return 6 if self.wander is None else 9
+
+    def with_wander(self, error: Float[Tensor, "n 6"]) -> Float[Tensor, "n k"]:
+        """Drift at the nodes where the poses' `error` is known there: with it how the bias wanders, where it may."""
+        if self.wander is None:
+            return error
+        way, journey = self.nodes.way, self.nodes.journey
+        return torch.cat((error, first_wander(error[:, :3], way, journey, self.wander)), dim=1)
+
+    def about_bias(self, drift: Float[Tensor, "n k"]) -> Float[Tensor, "n 6"]:
+        """The drift at the nodes less what the bias is there beside its constant."""
+        if self.wander is None:
+            return drift
+        return torch.cat((drift[:, :3] - drift[:, 6:], drift[:, 3:6]), dim=1)
 
     def terms(
-        self, scale: Float[Tensor, "j 3"], white_scale: Float[Tensor, "j 2"]
+        self, scale: Float[Tensor, "j _"], white_scale: Float[Tensor, "j 2"]
     ) -> dict[str, CostTerm]:
         """Absolute and relative regularisation of the poses, the sigmas scaled."""
         nodes = self.nodes
@@ -106,7 +142,14 @@ class PosePrior:
         journey, follows = nodes.journey, self.follows
         gap = (nodes.way[follows + 1] - nodes.way[follows]).clamp_min(0.1)[:, None]
         reach = self.length_m[journey[follows]]
-        step = drift[journey[follows]] * (-torch.expm1(-2 * gap / reach)).sqrt()
+        start, far = residuals.gauss_markov_start, drift
+        way, moves = residuals.gauss_markov_step, residuals.gauss_markov_step_jacobian
+        if self.wander is not None:
+            start = residuals.wandering_start
+            way, moves = residuals.wandering_step, residuals.wandering_step_jacobian
+            far = torch.cat((drift, self.wander.sigma * scale[:, 3:]), dim=1)
+            reach = torch.cat((reach, self.wander.length_m + 0 * reach[:, :3]), dim=1)
+        step = far[journey[follows]] * (-torch.expm1(-2 * gap / reach)).sqrt()
         return {
             "pose_bias": CostTerm(
                 residuals.gauss_markov_start,
@@ -116,17 +159,17 @@ class PosePrior:
                 takes_rows=True,
             ),
             "pose_absolute": CostTerm(
-                residuals.gauss_markov_start,
+                start,
                 self.slots["pose_absolute"],
-                weight=1 / drift[journey[self.begins]],
+                weight=1 / far[journey[self.begins]],
                 takes_rows=True,
             ),
             "pose_relative": CostTerm(
-                residuals.gauss_markov_step,
+                way,
                 self.slots["pose_relative"],
                 (torch.exp(-gap / reach),),
                 weight=1 / step,
-                jacobian=residuals.gauss_markov_step_jacobian,
+                jacobian=moves,
             ),
             "pose_white": CostTerm(
                 residuals.pose_deviation,
@@ -137,18 +180,20 @@ class PosePrior:
             ),
         }
 
-    def within_stretch(self, scale: Float[Tensor, "j 3"]) -> Float[Tensor, "j 6"]:
+    def within_stretch(self, scale: Float[Tensor, "j _"]) -> Float[Tensor, "j 6"]:
         """Variance of the drift within a stretch in which it is taken to stand still.
 
         It does move: by a random walk of a quarter of the stretch's length in the mean.
         """
-        drift = self._scaled(scale)[1]
-        return 2 * drift.square() / self.length_m * self.spacing_m / 4
+        walk = 2 * self._scaled(scale)[1].square() / self.length_m
+        if self.wander is not None:
+            walk[:, :3] += 2 * (self.wander.sigma * scale[:, 3:]).square() / self.wander.length_m
+        return walk * self.spacing_m / 4
 
     def rescaled(
-        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"], told: Float[Tensor, "j 6"]
-    ) -> Float[Tensor, "j 3"]:
-        """By journey, what the sigmas of its bias, of its drift and of its rotation are to be multiplied by.
+        self, drift: Float[Tensor, "n k"], scale: Float[Tensor, "j s"], told: Float[Tensor, "j k"]
+    ) -> Float[Tensor, "j s"]:
+        """By journey, what the sigmas of its bias, of its drift, of its rotation and its wander are to be multiplied by.
 
         `drift` is the estimated one. What all journeys share is taken off, and costs its degrees of freedom (restricted
         maximum likelihood); a journey's scale is drawn towards the fleet's, and that towards one. Changes count as far as
@@ -157,8 +202,8 @@ class PosePrior:
         return self._scales(drift, scale, told)[0]
 
     def expected_scale(
-        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"], told: Float[Tensor, "j 6"]
-    ) -> Float[Tensor, "j 3"]:
+        self, drift: Float[Tensor, "n k"], scale: Float[Tensor, "j s"], told: Float[Tensor, "j k"]
+    ) -> Float[Tensor, "j s"]:
         """`rescaled` as covariances need it: the root of the mean that a scale's square has, not of its median.
 
         A variance found from few numbers may well be larger than it seems: what rests on it has Student's covariance,
@@ -175,82 +220,73 @@ class PosePrior:
         return -2 * torch.expm1(-gap / self.length_m[own]) * self.drift_sigma[own].square()
 
     def _scales(
-        self, drift: Float[Tensor, "n 6"], scale: Float[Tensor, "j 3"], told: Float[Tensor, "j 6"]
-    ) -> tuple[Float[Tensor, "j 3"], Float[Tensor, "j 3"]]:
+        self, drift: Float[Tensor, "n k"], scale: Float[Tensor, "j s"], told: Float[Tensor, "j k"]
+    ) -> tuple[Float[Tensor, "j s"], Float[Tensor, "j s"]]:
         """The scales, and for each the mean of its square over the median."""
-        journeys, own = len(scale), self.nodes.journey
-        first, second = self.far.unbind(1)
-        change = (drift[second] - drift[first]).square() / self.expected_changes(self.far)
-        changes = drift.new_zeros(journeys, 6).index_add_(0, own[first], change)
-        pairs = torch.bincount(own[first], minlength=journeys).to(drift)[:, None] * told
+        journeys, own, config = len(scale), self.nodes.journey, self.config
+        slides, rolls = self.drift_sigma.square().split(3, dim=1)
+        expected = self.expected_changes(self.far)
+        changes, pairs = self._changes(self.about_bias(drift), self.far, expected, journeys)
+        pairs = pairs * told[:, :6]
+        # Of drift, rotation and wander: sums of squared changes, how many they are, and variances as given.
+        chains = list(zip(changes.split(3, 1), pairs.split(3, 1), (slides, rolls), strict=True))
+        slow = [self._share_of_mean(self.length_m[:, :3]) * slides, None]
+        if self.wander is not None:
+            wander, squares = self.wander, self.wander.sigma.square()
+            expected = wander.expected_changes(wander.far, self.nodes.way, own)
+            changes, pairs = self._changes(drift[:, 6:], wander.far, expected, journeys)
+            chains.append((changes, pairs * told[:, 6:], squares))
+            slow.append(self._share_of_mean(torch.full_like(squares, wander.length_m)) * squares)
         count = torch.bincount(own, minlength=journeys).to(drift)[:, None]
-        slow = self._share_of_mean()
         mean = self.nodes.mean(drift[:, :3], journeys)
         seen = count.clamp_max(1).expand(-1, 3)
-        bias, moves, turns = scale.square().unbind(1)
-        likely, wider = drift.new_ones(3), torch.ones_like(scale)
-        slides, rolls = self.drift_sigma.square().split(3, dim=1)
+        found, likely = list(scale.square().unbind(1)), list(drift.new_ones(self.scale_count))
+        wider = torch.ones_like(scale)
         for _ in range(_SWEEPS):
-            moves, of_moves, moves_wider = self._pooled(
-                likely[1], changes[:, :3], pairs[:, :3], moves[:, None] * slides
-            )
-            turns, of_turns, turns_wider = self._pooled(
-                likely[2], changes[:, 3:], pairs[:, 3:], turns[:, None] * rolls
-            )
-            spread = (
-                bias[:, None] * self.bias_sigma[:, :3].square() + moves[:, None] * slow * slides
-            )
+            for k, (changes, pairs, squares) in enumerate(chains, 1):
+                variance = found[k][:, None] * squares
+                found[k], likely[k], wider[:, k] = pooled(
+                    likely[k], changes, pairs, variance, config.scale_strength, config.scale_trust
+                )
+            spread = found[0][:, None] * self.bias_sigma[:, :3].square()
+            for of_mean, of_chain in zip(slow, found[1:], strict=True):
+                spread = spread if of_mean is None else spread + of_chain[:, None] * of_mean
             weight = seen / spread
             common = (weight * mean).sum(0) / weight.sum(0).clamp_min(1e-12)
-            squares = seen * bias[:, None] * (mean - common).square() / spread
-            bias, of_bias, bias_wider = self._pooled(likely[0], squares, seen, spread)
-            likely = torch.stack((of_bias, of_moves, of_turns))
-            wider = torch.stack((bias_wider, moves_wider, turns_wider), dim=1)
-        return torch.stack((bias, moves, turns), dim=1).sqrt(), wider
+            squares = seen * found[0][:, None] * (mean - common).square() / spread
+            found[0], likely[0], wider[:, 0] = pooled(
+                likely[0], squares, seen, spread, config.scale_strength, config.scale_trust
+            )
+        return torch.stack(found, dim=1).sqrt(), wider
 
-    def _pooled(
+    def _changes(
         self,
-        likely: Float[Tensor, ""],
-        squares: Float[Tensor, "j 3"],
-        count: Float[Tensor, "j 3"],
-        variance: Float[Tensor, "j 3"],
-    ) -> tuple[Float[Tensor, " j"], Float[Tensor, ""], Float[Tensor, " j"]]:
-        """Variance scales of journeys from sums of squares in units of the given sigmas, the medians of what they may be.
+        at_nodes: Float[Tensor, "n k"],
+        pair: Int[Tensor, "q 2"],
+        expected: Float[Tensor, "q k"],
+        journeys: int,
+    ) -> tuple[Float[Tensor, "j k"], Float[Tensor, "j 1"]]:
+        """By journey the sum of squared changes in units of those expected, and their number."""
+        first, second = pair.unbind(1)
+        own = self.nodes.journey[first]
+        change = (at_nodes[second] - at_nodes[first]).square() / expected
+        total = at_nodes.new_zeros(journeys, at_nodes.shape[1]).index_add_(0, own, change)
+        return total, torch.bincount(own, minlength=journeys).to(total)[:, None]
 
-        With them the fleet's `likely` one, anew, and the mean of each journey's over its median.
-        """
-        config = self.config
-        weight = (count > 0) / variance
-        of_common = weight / weight.sum(0).clamp_min(1e-300)
-        freedom = (count * (1 - of_common)).sum(1)
-        found, total = squares.sum(1), freedom.sum()
-        seen = freedom > 0
-        # Inverse chi-squared variances, their median the fleet's. Of it each journey tells by the mean of its inverse:
-        # one that is far too bad does not move it.
-        strength = _strength(found / likely, freedom, config.scale_strength)
-        centre = strength - 2 / 3
-        inverse = (strength + freedom) / (centre * likely + found) * seen
-        likely = strength / centre * seen.sum() / inverse.sum().clamp_min(1e-300)
-        likely = torch.where(total > 0, likely.clamp(*_SCALES_SQUARED), 1.0)
-        fleet = likely ** (total / (total + config.scale_trust))
-        own = (centre * fleet + found) / (centre + freedom)
-        wider = _mean_over_median(strength, freedom) * _mean_over_median(config.scale_trust, total)
-        return own.clamp(*_SCALES_SQUARED), likely, wider
-
-    def _share_of_mean(self) -> Float[Tensor, "j 3"]:
-        """Variance of a drift's mean over its journey's way, in units of the drift's."""
+    def _share_of_mean(self, length_m: Float[Tensor, "j 3"]) -> Float[Tensor, "j 3"]:
+        """Variance of a chain's mean over its journey's way, in units of the chain's."""
         journeys, own = len(self.length_m), self.nodes.journey
         first = self.nodes.way.new_full((journeys,), torch.inf)
         first = first.scatter_reduce(0, own, self.nodes.way, "amin")
         last = torch.zeros_like(first).scatter_reduce(0, own, self.nodes.way, "amax")
-        ratio = ((last - first).clamp_min(1.0)[:, None] / self.length_m[:, :3]).nan_to_num(1.0)
+        ratio = ((last - first).clamp_min(1.0)[:, None] / length_m).nan_to_num(1.0)
         return variance_of_mean(ratio)
 
     def _scaled(
-        self, scale: Float[Tensor, "j 3"]
+        self, scale: Float[Tensor, "j _"]
     ) -> tuple[Float[Tensor, "j 6"], Float[Tensor, "j 6"]]:
         """Sigmas of bias and drift."""
-        bias, moves, turns = (s[:, None].expand(-1, 3) for s in scale.unbind(1))
+        bias, moves, turns = (s[:, None].expand(-1, 3) for s in scale[:, :3].unbind(1))
         return (
             self.bias_sigma * torch.cat((bias, turns), dim=1),
             self.drift_sigma * torch.cat((moves, turns), dim=1),
@@ -260,43 +296,6 @@ class PosePrior:
 def variance_of_mean(ratio: Tensor) -> Tensor:
     """Of a Gauss-Markov chain's mean over a way `ratio` times its correlation length, in units of the chain's variance."""
     return 2 / ratio * (1 + torch.expm1(-ratio) / ratio)
-
-
-def _strength(
-    found: Float[Tensor, " j"], freedom: Float[Tensor, " j"], usual: float
-) -> Float[Tensor, ""]:
-    """Degrees of freedom of the inverse chi-squared variances that journeys have, as their spread shows.
-
-    `found` are sums of so many squares in units of the fleet's median variance. Each, over `nu - 2/3`, is beta-prime with
-    half of its own degrees of freedom and half of the `nu` that are asked for (empirical Bayes; Gelman et al., Bayesian
-    Data Analysis, 5); those are about the `usual` ones.
-    """
-    seen = freedom > 0
-    n = torch.where(seen, freedom, 1.0) / 2
-    log = torch.linspace(-3, 1, 9, dtype=found.dtype, device=found.device) * math.log(2)
-    nu = (usual * log.exp())[:, None].clamp_min(_LEAST_STRENGTH)
-    x = (torch.where(seen, found, 1.0) / (nu - 2 / 3)).clamp_min(1e-12)
-    evidence = (n - 1) * x.log() - (n + nu / 2) * torch.log1p(x) - (nu - 2 / 3).log()
-    evidence = evidence + torch.lgamma(n + nu / 2) - torch.lgamma(n) - torch.lgamma(nu / 2)
-    total = (evidence * seen).sum(1) - (log / _STRENGTH_SPREAD).square() / 2
-    return (torch.softmax(total, 0) * nu[:, 0].log()).sum().exp()
-
-
-def _mean_over_median(given: float | Tensor, found: Tensor) -> Tensor:
-    """Of an inverse chi-squared variance with so many degrees of freedom; 1 where none were found: it is as given."""
-    freedom = (given + found).clamp_min(3)
-    return torch.where(found > 0, (freedom - 2 / 3) / (freedom - 2), 1.0)
-
-
-_LEAST_STRENGTH = 3.0
-"""With fewer degrees of freedom a variance has no mean worth the name."""
-_STRENGTH_SPREAD = 1.0
-"""1-sigma of the logarithm of the journeys' degrees of freedom about the usual ones."""
-_SWEEPS = 60
-"""Alternations between scales and what all journeys share."""
-LEAST_SCALE, MOST_SCALE = 0.1, 10.0
-"""Sigmas are never taken for further from those that are given."""
-_SCALES_SQUARED = (LEAST_SCALE**2, MOST_SCALE**2)
 
 
 def pose_prior(
@@ -316,7 +315,7 @@ def pose_prior(
     white = pose.new_tensor([positioning.white_sigma_m] * 3 + [positioning.white_sigma_rad] * 3)
     begins = torch.nonzero(_begins(nodes.journey))[:, 0]
     follows = torch.nonzero(nodes.journey[1:] == nodes.journey[:-1])[:, 0]
-    far = _far_apart(nodes, begins, config.scale_lag_m)
+    far = nodes_apart(nodes.journey, nodes.way, config.scale_lag_m)
     every = torch.arange(len(journeys), device=pose.device)
     frame = torch.arange(len(pose), device=pose.device)
     slots = {
@@ -330,8 +329,16 @@ def pose_prior(
         "pose_white": (("pose", frame), ("drift", nodes.of_frame)),
     }
     length = length.expand(len(journeys), 6)
+    wander, reach = None, positioning.wander_length_m
+    is_long = long_drives(nodes.way, nodes.journey, len(journeys), reach)
+    if positioning.wander_sigma_m and bool(is_long.any()):
+        sigma = (WANDER_SHARE**0.5 * bias[:, :3]).clamp_max(positioning.wander_sigma_m)
+        left = (bias[:, :3].square() - sigma.square()).sqrt()
+        wander = bias_wander(sigma, is_long, nodes.journey, nodes.way, reach)
+        bias = torch.cat((torch.where(is_long[:, None], left, bias[:, :3]), bias[:, 3:]), dim=1)
     return PosePrior(
-        pose, nodes, spacing, bias, drift, length, white, begins, follows, far, config, slots
+        *(pose, nodes, spacing, bias, drift, length, white, begins, follows, far, config, slots),
+        wander=wander,
     )
 
 
@@ -369,17 +376,6 @@ def _sigmas(
         tilt = torch.minimum(tilt.square(), total / 2).sqrt()
         turn = (total - tilt.square()).sqrt()
     return torch.cat((bias, tilt)), torch.cat((drift, turn))
-
-
-def _far_apart(nodes: DriftNodes, begins: Tensor, lag: float) -> Int[Tensor, "q 2"]:
-    """The first nodes of successive stretches of `lag` metres of each journey."""
-    chain = _begins(nodes.journey).cumsum(0) - 1
-    cell = ((nodes.way - nodes.way[begins][chain]) / lag).floor()
-    enters = _begins(nodes.journey)
-    enters[1:] |= cell[1:] != cell[:-1]
-    at = torch.nonzero(enters)[:, 0]
-    same = nodes.journey[at[1:]] == nodes.journey[at[:-1]]
-    return torch.stack((at[:-1], at[1:]), dim=1)[same]
 
 
 def _begins(journey: Int[Tensor, " n"]) -> Tensor:

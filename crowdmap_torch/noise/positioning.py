@@ -34,8 +34,9 @@ CAR_CHANGES_M = 1e6
 class PositioningNoise(Settings):
     """What positioning gets wrong where it does not say itself; every sigma is 1-sigma per axis.
 
-    The error of a journey's poses is a constant bias, a slow drift about it (an Ornstein-Uhlenbeck process along the
-    way), and noise from frame to frame.
+    The error of a journey's poses is a bias, a drift about it (an Ornstein-Uhlenbeck process along the way), and noise from
+    frame to frame. Over kilometres the bias wanders: of drives that are long enough it is a constant and a second such
+    process, far slower.
     """
 
     bias_sigma_m: tuple[Sigma, Sigma, Sigma] = (0.6, 0.6, 0.9)
@@ -43,6 +44,11 @@ class PositioningNoise(Settings):
     simulations) and a consumer receiver beside an IMU (0.85 m); each journey's own scale is estimated from there."""
     bias_sigma_deg: Sigma = 0.05
     """Constant error of the rotation: the camera's place in its car included [deg]."""
+    wander_sigma_m: SigmaOrNone = 0.2
+    """How far the bias of the position wanders on long drives [m]; each journey's own scale is estimated from there. 0: it
+    does not."""
+    wander_length_m: Length = 3000.0
+    """Way over which its correlation falls to 1/e; drives of less than half of that have one bias [m]."""
     drift_sigma_m: Sigma = 0.25
     """Slow error of the position [m]; with it the paper's method ends near the paper's relative error (docs/RESULTS.md)."""
     drift_length_m: Length = 150.0

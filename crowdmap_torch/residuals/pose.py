@@ -26,15 +26,17 @@ def pose_prior(
 
 def pose_deviation(
     T_world_camera: Float[Tensor, "4 4 *#rows"],
-    drift: Float[Tensor, "6 *#rows"],
+    drift: Float[Tensor, "_ *#rows"],
     prior: Float[Tensor, "4 4 *#rows"],
 ) -> Float[Tensor, "6 *#rows"]:
     """What is left of a frame's pose error after the slow drift: the module's white noise (V-B, footnote).
 
+    Of the drift six numbers count.
+
     The error is the tangent from the prior pose to the pose. Absolute regularisation acts through the drift, relative
     regularisation between frames through the chain that the drift forms.
     """
-    return pose_prior(T_world_camera, prior) - drift
+    return pose_prior(T_world_camera, prior) - drift[:6]
 
 
 def relative_pose(
@@ -64,6 +66,27 @@ def gauss_markov_step(
     return after - mean - keep * (before - mean)
 
 
+def wandering_start(
+    state: Float[Tensor, "9 *#rows"], mean: Float[Tensor, "6 *#rows"]
+) -> Float[Tensor, "9 *#rows"]:
+    """How far the first state of a drift is from a bias that wanders, and that from its mean.
+
+    The state is the pose error (6) and how far the bias of the position is from its `mean` there (3).
+    """
+    wander = state[6:]
+    return torch.cat((state[:3] - wander - mean[:3], state[3:6] - mean[3:], wander))
+
+
+def wandering_step(
+    before: Float[Tensor, "9 *#rows"],
+    after: Float[Tensor, "9 *#rows"],
+    mean: Float[Tensor, "6 *#rows"],
+    keep: Float[Tensor, "9 *#rows"],
+) -> Float[Tensor, "9 *#rows"]:
+    """Innovations of a drift about a bias that wanders, and of that, as in `wandering_start`."""
+    return wandering_start(after, mean) - keep * wandering_start(before, mean)
+
+
 def sideways_parting(
     before: Float[Tensor, "k *#rows"],
     after: Float[Tensor, "k *#rows"],
@@ -87,12 +110,13 @@ def pose_prior_jacobian(
 
 def pose_deviation_jacobian(
     T_world_camera: Float[Tensor, "4 4 m"],
-    drift: Float[Tensor, "6 m"],
+    drift: Float[Tensor, "k m"],
     prior: Float[Tensor, "4 4 m"],
 ) -> tuple[Float[Tensor, "6 m"], tuple[Jacobian, Jacobian]]:
     """`pose_deviation` and its Jacobians by pose and drift."""
     error, (by_pose,) = pose_prior_jacobian(T_world_camera, prior)
-    return error - drift, (by_pose, SparseJacobian.diagonal(-torch.ones_like(drift)))
+    by_drift = SparseJacobian.diagonal(-torch.ones_like(drift[:6]))
+    return error - drift[:6], (by_pose, SparseJacobian(len(drift), by_drift.rows))
 
 
 def relative_pose_jacobian(
@@ -123,6 +147,30 @@ def gauss_markov_step_jacobian(
     by = (-keep, torch.ones_like(keep), keep - 1)
     error = gauss_markov_step(before, after, mean, keep)
     return error, tuple(SparseJacobian.diagonal(entries) for entries in by)
+
+
+def wandering_step_jacobian(
+    before: Float[Tensor, "9 m"],
+    after: Float[Tensor, "9 m"],
+    mean: Float[Tensor, "6 m"],
+    keep: Float[Tensor, "9 m"],
+) -> tuple[Float[Tensor, "9 m"], tuple[Jacobian, ...]]:
+    """`wandering_step` and its Jacobians by the two states and the mean."""
+    one, none = torch.ones_like(keep), torch.zeros_like(keep[:3])
+
+    def by_state(factor: Float[Tensor, "9 m"]) -> SparseJacobian:
+        diagonal = SparseJacobian.diagonal(factor).rows
+        # Position and wander of an axis are six apart.
+        drawn = (
+            (i, torch.cat((factor[i : i + 1], none, none[:2], -factor[i : i + 1])))
+            for i in range(3)
+        )
+        return SparseJacobian(9, (*drawn, *diagonal[3:]))
+
+    of_mean = SparseJacobian.diagonal((keep - 1)[:6]).rows
+    by_mean = SparseJacobian(6, (*of_mean, *((0, none[:1]) for _ in range(3))))
+    error = wandering_step(before, after, mean, keep)
+    return error, (by_state(-keep), by_state(one), by_mean)
 
 
 def _step(

@@ -12,7 +12,7 @@ from crowdmap_torch.geometry import polygon
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.mapper import MapResult
-from crowdmap_torch.noise.pose_prior import LEAST_SCALE, MOST_SCALE
+from crowdmap_torch.noise.pooled_scales import LEAST_SCALE, MOST_SCALE
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.summaries import (
     counts_of,
@@ -77,8 +77,10 @@ def metrics_of(
 
 def _named_scales(scale: Sequence[float]) -> dict[str, object]:
     """What the sigmas of a journey's errors were multiplied by, by name; and which of these could not go further."""
-    named = dict(zip(("bias", "drift", "rotation", "noise", "rotation_noise"), scale, strict=True))
-    bounds = [LEAST_SCALE, LEAST_SCALE, LEAST_SCALE, 0.0, 0.0]
+    of_noise = ("noise", "rotation_noise")
+    of_prior = ("bias", "drift", "rotation", "wander")[: len(scale) - len(of_noise)]
+    named = dict(zip((*of_prior, *of_noise), scale, strict=True))
+    bounds = [*(LEAST_SCALE for _ in of_prior), *(0.0 for _ in of_noise)]
     at_bound = [
         name
         for (name, found), least in zip(named.items(), bounds, strict=True)

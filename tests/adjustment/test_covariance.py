@@ -25,11 +25,15 @@ from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.tables import Dataset
 
 
-@pytest.fixture(scope="module")
-def bundle(tiny: Dataset, tiny_result: MapResult) -> Bundle:
-    """Three journeys with a frame every six metres."""
+@pytest.fixture(scope="module", params=[3000.0, 60.0], ids=["short", "long"])
+def bundle(request: pytest.FixtureRequest, tiny: Dataset, tiny_result: MapResult) -> Bundle:
+    """Three journeys with a frame every six metres; the bias is one, or wanders within what was driven."""
     config = MapperConfig()
-    config = replace(config, adjust=replace(config.adjust, frame_spacing_m=6.0))
+    config = replace(
+        config,
+        adjust=replace(config.adjust, frame_spacing_m=6.0),
+        positioning=replace(config.positioning, wander_length_m=request.param),
+    )
     maps, first = tiny_result.journey_maps, tiny_result.first
     built = build_bundle(tiny.journeys, maps, first, config)
     adjust.start(built)
@@ -123,12 +127,12 @@ def test_biases_are_means_of_the_drift_along_the_way(bundle: Bundle, found: MapU
     for journey in range(3):
         mine = torch.nonzero(nodes.journey == journey)[:, 0]
         R = values["pose"][nodes.first[mine], :3, :3]
-        turn = (R @ values["drift"][mine, 3:, None])[:, 2, 0]
+        turn = (R @ values["drift"][mine, 3:6, None])[:, 2, 0]
         mean = torch.cat((values["drift"][mine, :3].mean(0), turn.mean()[None]))
         torch.testing.assert_close(found.bias[journey], mean)
-        push = torch.zeros(len(mine), 6, 4, dtype=torch.float64)
+        push = torch.zeros(len(mine), bundle.prior.numbers, 4, dtype=torch.float64)
         push[:, :3, :3] = torch.eye(3)
-        push[:, 3:, 3] = R[:, 2]
+        push[:, 3:6, 3] = R[:, 2]
         push = push.flatten(0, 1) / len(mine)
         own = at[mine].flatten()
         expected = push.mT @ covariance[own][:, own] @ push

@@ -8,14 +8,21 @@ from torch import Tensor
 from worlds.pose_priors import make_prior
 
 from crowdmap_torch.noise.pose_evidence import sampled_changes, share_told, white_scales
+from crowdmap_torch.noise.pose_prior import PosePrior
+from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 
 F64 = torch.float64
+
+
+def changes_of(prior: PosePrior) -> ChainChanges:
+    """Those of the drift that are asked for."""
+    return sampled_changes(prior, prior.far, torch.eye(prior.numbers, dtype=F64))
 
 
 def test_changes_are_told_by_what_is_left_of_their_variance():
     prior = make_prior(3)
     scale = torch.tensor([[1.0, 2.0, 0.5]], dtype=F64).expand(3, 3)
-    changes = sampled_changes(prior)
+    changes = changes_of(prior)
     journey = prior.nodes.journey[changes.pair]
     assert torch.equal(journey[:, 0], journey[:, 1]) and set(journey.flatten().tolist()) == {
         0,
@@ -32,11 +39,11 @@ def test_changes_are_told_by_what_is_left_of_their_variance():
 
 
 def test_no_more_changes_are_asked_for_than_are_solved_at_once():
-    short, long = (sampled_changes(make_prior(2, way_m=way)) for way in (400.0, 9000.0))
+    short, long = (changes_of(make_prior(2, way_m=way)) for way in (400.0, 9000.0))
     assert short.columns == 3 and long.columns == 8
     for changes, most in ((short, 3), (long, 8)):
         assert torch.bincount(changes.column).tolist() == [2] * most
-    assert sampled_changes(make_prior(2, way_m=50.0)).columns == 0
+    assert changes_of(make_prior(2, way_m=50.0)).columns == 0
 
 
 def estimated(noise: Tensor, sigma: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:

@@ -174,7 +174,7 @@ def test_what_all_journeys_share_errs_as_much_as_the_expected_scales_say(journey
         drift = without_common(prior, path, ones)
         for squares, scales in ((found, prior.rescaled), (expected, prior.expected_scale)):
             bias, slow, _ = scales(drift, ones, ones.repeat(1, 2)).square()[..., None].unbind(1)
-            slow = slow * prior._share_of_mean()
+            slow = slow * prior._share_of_mean(prior.length_m[:, :3])
             of_mean = (
                 bias * prior.bias_sigma.square()[:, :3] + slow * prior.drift_sigma.square()[:, :3]
             )

@@ -36,6 +36,8 @@ CATALOGUE: dict[Callable[..., Tensor], tuple[str, ...]] = {
     pose.relative_pose: ("pose", "pose"),
     pose.gauss_markov_start: ("drift", "drift"),
     pose.gauss_markov_step: ("drift", "drift", "drift"),
+    pose.wandering_start: ("wander", "error"),
+    pose.wandering_step: ("wander", "wander", "error"),
     pose.sideways_parting: ("drift", "drift"),
     sign_prior.sign_habit: ("pose", "size"),
     sign_prior.sign_place: ("pose", "size"),
@@ -48,6 +50,7 @@ KINDS = {
     "size": Variable(2, positive),
     "drift": Variable(8, euclidean),
     "error": Variable(6, euclidean),
+    "wander": Variable(9, euclidean),
 }
 ROWS = 24
 CORNERS = 3
@@ -90,15 +93,19 @@ def drawn() -> dict[str, Tensor]:
         corners_template=noise(CORNERS, 2, scale=0.4), corners_observation=observation,
     )  # fmt: skip
     names["typical_size"] = names["usual"]
+    wander = dict(state=noise(9), before=noise(9), after=noise(9), mean=noise(6))
+    names |= {f"wandering_{name}": value for name, value in wander.items()}
+    names["wandering_keep"] = noise(9).sigmoid()
     return names | {f"c{i}": point + step for i, step in enumerate(steps)}
 
 
 def term_of(residual: Callable[..., Tensor]) -> tuple[CostTerm, dict[str, Tensor]]:
     """A term of that residual, every slot a variable of its own, and the values to take it at."""
     kinds, names = CATALOGUE[residual], drawn()
-    of_corners = "corners_" if residual.__name__.endswith("sign_view") else ""
+    kind = "corners_" if residual.__name__.endswith("sign_view") else ""
+    kind = "wandering_" if residual.__name__.startswith("wandering") else kind
     arguments = [
-        names.get(of_corners + name, names[name]) for name in inspect.signature(residual).parameters
+        names.get(kind + name, names[name]) for name in inspect.signature(residual).parameters
     ]
     every = torch.arange(ROWS)
     slots = tuple((f"{i}_{kind}", every) for i, kind in enumerate(kinds))

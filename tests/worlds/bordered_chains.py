@@ -108,6 +108,29 @@ def shared_drives(lengths=(30, 1, 17), marks=7, seed=0):
     return Problem(variables, terms), values, replace(plan, shared={"car": car})
 
 
+def wandering_drives(lengths=(30, 1, 17), marks=7, seed=0):
+    """`drives` whose chains have a third number, by which what they are drawn to wanders: wider than the poses."""
+    problem, values, plan = drives(lengths, marks, seed)
+    terms = problem.terms
+
+    def start(d, b):
+        return torch.cat((d[:2] - d[2:] - b, d[2:]))
+
+    def step(before, after, b):
+        return start(after, b) - KEEP * start(before, b)
+
+    terms = {
+        **terms,
+        "start": replace(terms["start"], residual=start),
+        "step": replace(terms["step"], residual=step),
+        "bound": replace(terms["bound"], residual=lambda x, d: x - d[:2]),
+    }
+    generator = torch.Generator().manual_seed(seed + 2)
+    drift = torch.randn(len(plan.chain), 3, dtype=torch.float64, generator=generator)
+    variables = {**problem.variables, "drift": Variable(3, euclidean)}
+    return Problem(variables, terms), {**values, "drift": drift}, plan
+
+
 def rows_of(dense, name):
     """Rows of a variable's tangents in the dense system."""
     at = dense.where.offset[name][:, None]

@@ -105,7 +105,7 @@ class BorderedNormalEquations:
         if bool(failed) or not bool(reduced.T.isfinite().all()):
             return failed_step(still, self.cost)
         structure, entry = self.inner.structure, self._entries()
-        x = torch.cat([held.delta[name] for name in structure.plan.first_block])
+        x = structure.stack(held.delta)
         y = structure.where.pack(held.delta)[0]
         right_side = self.gradient.index_add(
             0, entry.flatten(), self._by_chain(x[..., None])[..., 0].flatten()
@@ -136,7 +136,7 @@ class BorderedNormalEquations:
         """Covariance of every block of an eliminated variable, landmarks and border known."""
         return self.inner.conditional_covariance(name)
 
-    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
         """Variances of changes along chains by the last factors, landmarks and border known."""
         return self.inner.variance_of_changes(changes)
 

@@ -89,7 +89,9 @@ class ChainBackend:
         """The same, and the sums that they were made of, the border's blocks among them."""
         structure, workspace = self.prepare(problem, values)
         coupling = {
-            name: workspace.coupling(name, coupling.column.shape)
+            name: workspace.coupling(
+                name, (*coupling.column.shape, structure.width[coupling.variable])
+            )
             for name, coupling in structure.couplings.items()
         }
         sums = ReducibleSums(structure, problem, values, coupling)
@@ -130,7 +132,7 @@ class Workspace:
     """Matrix of the reduced system, upper triangle; one row more for its right-hand side, one for padding."""
     store: Float[Tensor, "rows k"]
     """Per eliminated block and column of its window a row of `k`, by when it is eliminated."""
-    couplings: dict[str, Float[Tensor, "f w k"]] = field(default_factory=dict)
+    couplings: dict[str, Float[Tensor, "f w _"]] = field(default_factory=dict)
     """Of the last normal equations, by term."""
     factor: Factor | None = None
     """Of the last solve."""
@@ -141,10 +143,10 @@ class Workspace:
         dim = structure.where.dim + 2
         return cls(like.new_zeros(dim, dim), like.new_empty(structure.store_rows + 1, k))
 
-    def coupling(self, name: str, shape: torch.Size) -> Float[Tensor, "f w k"]:
+    def coupling(self, name: str, shape: tuple[int, ...]) -> Float[Tensor, "f w _"]:
         """Memory for a term's coupling; what is in it is of no account."""
-        if name not in self.couplings or self.couplings[name].shape[:-1] != shape:
-            self.couplings[name] = self.store.new_empty(*shape, self.store.shape[1])
+        if name not in self.couplings or self.couplings[name].shape != shape:
+            self.couplings[name] = self.store.new_empty(shape)
         return self.couplings[name]
 
 
@@ -169,7 +171,8 @@ class ChainNormalEquations:
     link: Float[Tensor, "e k k"]
     """Block of each node with its successor, of each leaf with the block that carries it."""
     eliminated_gradient: Float[Tensor, "e k"]
-    coupling: Mapping[str, Float[Tensor, "f w k"]]
+    coupling: Mapping[str, Float[Tensor, "f w _"]]
+    """Blocks of B by term, as wide as the eliminated variable."""
     hessian: Float[Tensor, "r r"]
     gradient: Float[Tensor, " r"]
     workspace: Workspace = field(repr=False)
@@ -220,7 +223,7 @@ class ChainNormalEquations:
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, the landmarks known."""
         found = diagonal_of_inverse(self.structure, self.diagonal, self.link)
-        return self.structure.unstack(found)[name]
+        return self.structure.unstack(found)[name][..., : self.structure.width[name]]
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
         """Variance of each leaf's numbers less those of the block that carries it, landmarks and border known."""
@@ -232,19 +235,25 @@ class ChainNormalEquations:
         # The leaf goes with its carrier by -H^-1 times their link.
         lags = alone @ self.link[: plan.leaf_count]
         lags.diagonal(dim1=-2, dim2=-1).add_(1)
-        return (alone + lags @ of_carrier @ lags.mT).diagonal(dim1=-2, dim2=-1)
+        left = alone + lags @ of_carrier @ lags.mT
+        assert plan.leaves is not None
+        return left.diagonal(dim1=-2, dim2=-1)[:, : self.structure.width[plan.leaves]]
 
-    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
         """Variances of the changes between blocks of chains, by the last factors: leaves marginalised, all else known."""
-        like, k = self.eliminated_gradient, self.eliminated_gradient.shape[1]
-        leaves, number = self.structure.plan.leaf_count, torch.arange(k, device=like.device)
-        at = (*changes.pair.add(leaves).T[..., None], changes.column[:, None] * k + number)
-        right_side = like.new_zeros(len(like), k, changes.columns * k)
-        first, second, column = at
-        right_side[first, number, column] = -1
-        right_side[second, number, column] = 1
-        found = self.solve_eliminated(right_side)
-        return found[second, number, column] - found[first, number, column]
+        like, of = self.eliminated_gradient, changes.of
+        k, m = self.eliminated_gradient.shape[1], of.shape[1]
+        first, second = changes.pair.add(self.structure.plan.leaf_count).T
+        variance = like.new_zeros(len(changes.pair), m)
+        for column in range(changes.columns):
+            rows = torch.nonzero(changes.column == column)[:, 0]
+            right_side = like.new_zeros(len(like), k, m)
+            right_side[first[rows]] = -of
+            right_side[second[rows]] = of
+            found = self.solve_eliminated(right_side)
+            change = found[second[rows]] - found[first[rows]]
+            variance[rows] = (of * change).sum(1)
+        return variance
 
     def factorise(
         self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"]
@@ -258,10 +267,11 @@ class ChainNormalEquations:
         store.zero_()
         for name, block in self.coupling.items():
             rows, block = structure.factor_rows[name], block.flatten(0, 1)
+            narrow = store[:, : block.shape[1]]
             if name in structure.alone:
-                store.index_copy_(0, rows, block)
+                narrow.index_copy_(0, rows, block)
             else:
-                store.index_add_(0, rows, block)
+                narrow.index_add_(0, rows, block)
         store[structure.right_side_row] = self.eliminated_gradient
         dim = len(self.gradient)
         system = self.workspace.system
@@ -332,7 +342,8 @@ class ChainNormalEquations:
                 here = slice(at, at + CHUNK_ROWS)
                 of = coupling.block[here]
                 entry = coupling.column[here] * columns + column[of][:, None]
-                total.index_add_(0, entry.flatten(), (block[here] @ x[of]).flatten(0, 1))
+                product = block[here] @ x[of, : block.shape[2]]
+                total.index_add_(0, entry.flatten(), product.flatten(0, 1))
         return total.view(-1, columns, x.shape[-1])
 
     def couple_back(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
@@ -341,7 +352,7 @@ class ChainNormalEquations:
         for name, block in self.coupling.items():
             coupling = self.structure.couplings[name]
             product = (y[coupling.column][:, None] @ block)[:, 0]
-            total.index_add_(0, coupling.block, product)
+            total[:, : product.shape[1]].index_add_(0, coupling.block, product)
         return total
 
     def _substitute(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:

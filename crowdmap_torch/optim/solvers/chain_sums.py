@@ -11,7 +11,7 @@ from torch import Tensor
 from crowdmap_torch.optim.linearize import RowBlocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, add_blocks, pairs
-from crowdmap_torch.optim.solvers.elimination import ChainStructure, Coupling
+from crowdmap_torch.optim.solvers.elimination import ChainStructure, Coupling, padded
 
 
 class ChainSums:
@@ -20,7 +20,7 @@ class ChainSums:
     def __init__(self, structure: ChainStructure, problem: Problem, values: Values) -> None:
         plan = structure.plan
         like, k = values[plan.chains], problem.variables[plan.chains].tangent_dim
-        self.structure = structure
+        self.structure, self._k = structure, k
         self.by_variable = BlockDiagonal(problem, values)
         self.link = like.new_zeros(len(structure.owner), k, k)
         """Block of A of each chain's block with its successor, of each leaf with the block that carries it."""
@@ -38,21 +38,31 @@ class ChainSums:
             (name, block), (other, block_of_other) = chunk.slots[i], chunk.slots[j]
             if name in first and other in first:
                 here, there = block + first[name], block_of_other + first[other]
-                self._add_link(here, there, chunk.blocks.hessian[i, j].permute(2, 0, 1))
+                square = padded(chunk.blocks.hessian[i, j].permute(2, 0, 1), 1, self._k)
+                self._add_link(here, there, padded(square, 2, self._k))
             elif name in first and other in self.border:
-                beside = chunk.blocks.hessian[i, j].permute(2, 0, 1)
+                beside = padded(chunk.blocks.hessian[i, j].permute(2, 0, 1), 1, self._k)
                 self.border[other].index_add_(0, block + first[name], beside)
             elif name in self.border and other in first:
-                beside = chunk.blocks.hessian[i, j].permute(2, 1, 0)
+                beside = padded(chunk.blocks.hessian[i, j].permute(2, 1, 0), 1, self._k)
                 self.border[name].index_add_(0, block_of_other + first[other], beside)
 
     def diagonal(self) -> Float[Tensor, "e k k"]:
         """Diagonal blocks of A, counted over leaves and chains."""
-        return _stacked([self.by_variable.hessian(n) for n in self.structure.plan.first_block])
+        parts = []
+        for name in self.structure.plan.first_block:
+            square = self.by_variable.hessian(name)
+            width = square.shape[1]
+            square = padded(padded(square, 1, self._k), 2, self._k)
+            # What is padded stands for itself.
+            square.diagonal(dim1=1, dim2=2)[:, width:] = 1
+            parts.append(square)
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     def gradient(self) -> Float[Tensor, "e k"]:
         """The gradient a, likewise."""
-        return _stacked([self.by_variable.gradient(n) for n in self.structure.plan.first_block])
+        names = self.structure.plan.first_block
+        return self.structure.stack({name: self.by_variable.gradient(name) for name in names})
 
     def _add_link(
         self, here: Int[Tensor, " m"], there: Int[Tensor, " m"], block: Float[Tensor, "m k k"]
@@ -80,9 +90,9 @@ class ReducibleSums(ChainSums):
         structure: ChainStructure,
         problem: Problem,
         values: Values,
-        coupling: Mapping[str, Float[Tensor, "f w k"]],
+        coupling: Mapping[str, Float[Tensor, "f w _"]],
     ) -> None:
-        """`coupling` is memory for B, by term; what is in it is of no account."""
+        """`coupling` is memory for B, by term, as wide as its eliminated block; what is in it is of no account."""
         super().__init__(structure, problem, values)
         dim, like = structure.where.dim, values[structure.plan.chains]
         self.coupling = coupling
@@ -149,7 +159,7 @@ class ReducibleSums(ChainSums):
 
 
 def _add_coupling(
-    total: Float[Tensor, "f w k"], coupling: Coupling, chunk: TermRows[RowBlocks], border: set[str]
+    total: Float[Tensor, "f w _"], coupling: Coupling, chunk: TermRows[RowBlocks], border: set[str]
 ) -> None:
     """Adds the blocks between the rows' eliminated slot and those of landmarks, in place."""
     slot, start = coupling.slot, 0
@@ -164,7 +174,3 @@ def _add_coupling(
             total[chunk.at, here] = block
         else:
             total[:, here].index_add_(0, coupling.factor_of_row[chunk.at], block)
-
-
-def _stacked(parts: list[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(parts)

@@ -188,7 +188,7 @@ class ConjugateGradientEquations:
         """Covariance of every block of an eliminated variable, landmarks and border known."""
         return self.inner.conditional_covariance(name)
 
-    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
         """Variances of changes along chains by the last factors, landmarks and border known."""
         return self.inner.variance_of_changes(changes)
 
@@ -328,7 +328,7 @@ class _Eliminated:
     def solve(self, right_side: Tangents) -> dict[str, Tensor]:
         """E^-1 of right-hand sides, of which those of its own variables count."""
         structure = self.inner.structure
-        stacked = torch.cat([right_side[name] for name in structure.plan.first_block])
+        stacked = structure.stack(right_side)
         x, found = self.inner.solve_eliminated(stacked), {}
         if self.border is not None:
             assert self.factor is not None

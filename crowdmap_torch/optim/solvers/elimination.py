@@ -50,6 +50,8 @@ class Coupling:
     """Columns of each of them."""
     slot: int
     """Slot of the eliminated block."""
+    variable: str
+    """Its variable."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class ChainStructure:
     """Everything about the elimination that does not depend on values."""
 
     plan: EliminationPlan
+    width: Mapping[str, int]
+    """Tangents of a leaf and of a chain's block, by variable; leaves may be narrower, and are padded to the chains'."""
     where: Layout
     """The reduced system: all variables but those that the plan names."""
     couplings: dict[str, Coupling]
@@ -99,11 +103,29 @@ class ChainStructure:
         links = torch.cat((link, torch.zeros_like(none)))
         return torch.cat((diagonal, none))[self.order], links[self.order]
 
-    def unstack(self, stacked: Float[Tensor, "e ..."]) -> dict[str, Tensor]:
-        """Rows of the leaves and of the chains, by variable."""
+    def stack(self, tangents: Mapping[str, Tensor]) -> Float[Tensor, "e k ..."]:
+        """Tangents of the leaves and of the chains, one behind the other; narrower ones are padded with zeros."""
+        k = self.width[self.plan.chains]
+        parts = [padded(tangents[name], 1, k) for name in self.plan.first_block]
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    def unstack(self, stacked: Float[Tensor, "e k ..."]) -> dict[str, Tensor]:
+        """Rows of the leaves and of the chains, by variable, without what they were padded with."""
         first = self.plan.first_block
         bounds = [*first.values(), len(stacked)]
-        return {name: stacked[a:b] for name, a, b in zip(first, bounds, bounds[1:], strict=False)}
+        return {
+            name: stacked[a:b, : self.width[name]]
+            for name, a, b in zip(first, bounds, bounds[1:], strict=False)
+        }
+
+
+def padded(block: Float[Tensor, ...], dim: int, size: int) -> Float[Tensor, ...]:
+    """The block with zeros behind it along an axis; itself where it is as long as that."""
+    missing = size - block.shape[dim]
+    if not missing:
+        return block
+    shape = [*block.shape[:dim], missing, *block.shape[dim + 1 :]]
+    return torch.cat((block, block.new_zeros(shape)), dim=dim)
 
 
 def analyse(
@@ -134,6 +156,8 @@ def analyse(
     landmarks = LandmarkBlocks.of(where, plan.chain.device)
     owner = plan.owner
     k = problem.variables[plan.chains].tangent_dim
+    if plan.leaves is not None and problem.variables[plan.leaves].tangent_dim > k:
+        raise ValueError(f"{plan.leaves!r}: expected leaves of at most {k} tangents, the chains'")
     # About as many as there are drives: those that see one stretch of road at the same step.
     size = group_size or min(64, max(4, plan.chain_count))
     builder = WindowBuilder(landmarks, len(owner), size, k, batch_bytes)
@@ -149,6 +173,7 @@ def analyse(
     couplings, factor_rows = _placed(couplings, landmarks, builder)
     return ChainStructure(
         plan=plan,
+        width={name: problem.variables[name].tangent_dim for name in plan.first_block},
         where=where,
         couplings=couplings,
         rounds=tuple(builder.round(*of_round, place) for of_round in windows),
@@ -287,7 +312,7 @@ def _coupling(
         landmarks.width_of[other] for i, (other, _) in enumerate(term.slots) if i != slot
     )
     column = landmarks.columns(landmark, widths)
-    return Coupling(order, factor_of_row, block[first], column, landmark, widths, slot)
+    return Coupling(order, factor_of_row, block[first], column, landmark, widths, slot, name)
 
 
 def _coupled_landmarks(

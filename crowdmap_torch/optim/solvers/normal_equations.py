@@ -103,6 +103,8 @@ class ChainChanges:
     """The blocks, the first is subtracted."""
     column: Int[Tensor, " q"]
     """Those of one column are of different chains, and asked for at once."""
+    of: Float[Tensor, "k m"]
+    """By columns, the sums of a block's numbers whose changes they are."""
 
     @property
     def columns(self) -> int:
@@ -174,7 +176,7 @@ class MapEquations(NormalEquations, Protocol):
         """Covariance of every block of an eliminated variable, landmarks and border known."""
         ...
 
-    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q k"]:
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
         """Variances of changes along chains by the factors of the last step, landmarks and border known."""
         ...
 

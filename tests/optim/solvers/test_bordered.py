@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from worlds.bordered_chains import drives, rows_of, shared_drives
+from worlds.bordered_chains import drives, rows_of, shared_drives, wandering_drives
 
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 
-@pytest.mark.parametrize("world", [drives, shared_drives])
+@pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
 @pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
 def test_a_border_gives_the_dense_step(lengths, world):
     problem, values, plan = world(lengths)
@@ -28,13 +28,14 @@ def test_a_border_gives_the_dense_step(lengths, world):
         torch.testing.assert_close(mine.norm, theirs.norm)
 
 
-@pytest.mark.parametrize("world", [drives, shared_drives])
+@pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
 def test_covariances_are_blocks_of_the_dense_inverse(world):
     problem, values, plan = world()
     dense = DenseBackend().assemble(problem, values)
     inverse, chain = torch.linalg.inv(dense.hessian[0]), plan.chain
     # Sums over each chain: of the first entry by mean, of the second by differing weights.
-    weight = torch.zeros(len(chain), 2, 2, dtype=torch.float64)
+    width = values["drift"].shape[1]
+    weight = torch.zeros(len(chain), width, 2, dtype=torch.float64)
     weight[:, 0, 0] = 1 / torch.bincount(chain)[chain].double()
     weight[:, 1, 1] = torch.linspace(-1, 2, len(chain)).double()
     found = BorderedBackend(plan).assemble(problem, values).covariance(floor=0.0)
@@ -44,7 +45,7 @@ def test_covariances_are_blocks_of_the_dense_inverse(world):
     torch.testing.assert_close(of_marks, inverse[mark][:, mark], rtol=1e-8, atol=1e-12)
     per_chain = torch.zeros(len(drift), 4, 2, dtype=torch.float64)
     rows = torch.arange(len(drift))
-    per_chain[rows, chain[rows // 2]] = weight.flatten(0, 1)
+    per_chain[rows, chain[rows // width]] = weight.flatten(0, 1)
     sums = per_chain.flatten(1)
     joint = (sums.mT @ inverse[drift][:, drift] @ sums).view(4, 2, 4, 2)
     every = torch.arange(4)
@@ -65,7 +66,7 @@ def test_a_covariance_whose_factors_are_gone_is_refused():
         covariance.of_chain_sums(torch.zeros(len(plan.chain), 2, 1, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("world", [drives, shared_drives])
+@pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
 def test_the_minimum_is_that_of_the_dense_back_end(world):
     problem, values, plan = world(seed=1)
     config = lm.LmConfig(cost_tolerance=1e-13)

@@ -309,7 +309,10 @@ def test_changes_along_chains_vary_as_the_dense_inverse_says():
     normal = ChainBackend(EliminationPlan("pose", chain)).assemble(built, values)
     tiny = torch.tensor([1e-12], dtype=torch.float64)
     normal.solve(tiny)
-    changes = ChainChanges(torch.tensor([[0, 5], [12, 15], [5, 11]]), torch.tensor([0, 0, 1]))
+    pair, column = torch.tensor([[0, 5], [12, 15], [5, 11]]), torch.tensor([0, 0, 1])
+    # The numbers of a block, and the first less the last.
+    of = torch.cat((torch.eye(3), torch.tensor([[1.0], [0.0], [-1.0]])), dim=1).double()
+    changes = ChainChanges(pair, column, of)
     found = normal.variance_of_changes(changes)
     dense = DenseBackend().assemble(built, values)
     H, where = dense.hessian[0], dense.where
@@ -317,9 +320,9 @@ def test_changes_along_chains_vary_as_the_dense_inverse_says():
     # The landmarks known: their rows and columns struck out.
     P = torch.linalg.inv(H[at.flatten()[:, None], at.flatten()]).view(len(chain), 3, len(chain), 3)
     for k, (a, b) in enumerate(changes.pair.tolist()):
-        for i in range(3):
-            expected = P[a, i, a, i] + P[b, i, b, i] - 2 * P[a, i, b, i]
-            assert float(found[k, i]) == pytest.approx(float(expected), rel=1e-6)
+        change = P[a, :, a] + P[b, :, b] - P[a, :, b] - P[b, :, a]
+        expected = (of.T @ change @ of).diagonal()
+        torch.testing.assert_close(found[k], expected, rtol=1e-6, atol=0)
 
 
 def test_leaves_vary_about_what_carries_them_as_the_dense_inverse_says():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from worlds.bordered_chains import drives, rows_of, shared_drives
+from worlds.bordered_chains import drives, rows_of, shared_drives, wandering_drives
 
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
@@ -19,7 +19,7 @@ def conjugate_gradients(plan: EliminationPlan, **changes) -> ConjugateGradientBa
     return ConjugateGradientBackend(plan, **settings)
 
 
-@pytest.mark.parametrize("world", [drives, shared_drives])
+@pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
 @pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
 def test_conjugate_gradients_give_the_dense_step(lengths, world):
     problem, values, plan = world(lengths)

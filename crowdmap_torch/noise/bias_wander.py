@@ -1,0 +1,111 @@
+"""The bias of positioning over kilometres: a second Gauss-Markov process, far slower than the drift about it.
+
+Of a drive that is long beside the way on which the bias forgets where it was, one constant is no longer what its poses have
+in common. Its drift is then drawn to the constant bias and to what this process adds to it, which stands behind the
+pose's error in every node's state. Shorter drives have a process next to zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import group_range
+
+LEAST_SHARE = 0.5
+"""Drives that are shorter than this share of the way on which their bias forgets where it was have one bias."""
+WANDER_SHARE = 0.5
+"""Most of the variance that is stated for a bias that is taken for one that wanders."""
+_LAG = 1 / 3
+"""Over this share of that way changes are compared with their sigma."""
+_START = 1 / 6
+"""Over this share of it an estimate that is known is averaged where the process begins."""
+_AT_REST_M = 1e-4
+"""1-sigma of the process in drives that have one bias."""
+
+
+@dataclass(frozen=True)
+class BiasWander:
+    """The prior of the process, in the drives of a bundle of which one at least is long enough for it."""
+
+    sigma: Float[Tensor, "j 3"]
+    """By journey, east, north and up [m]; next to none where one is too short for it."""
+    is_long: Bool[Tensor, " j"]
+    """Whether it is not."""
+    length_m: float
+    far: Int[Tensor, "q 2"]
+    """Nodes of long drives whose changes tell of the sigma, each the end of at most one such pair."""
+
+    def expected_changes(
+        self, pair: Int[Tensor, "q 2"], way: Float[Tensor, " n"], journey: Int[Tensor, " n"]
+    ) -> Float[Tensor, "q 3"]:
+        """Mean squares of the process's changes between nodes, by the sigmas as given."""
+        first, second = pair.unbind(1)
+        gap = (way[second] - way[first])[:, None]
+        return -2 * torch.expm1(-gap / self.length_m) * self.sigma[journey[first]].square()
+
+
+def long_drives(
+    way: Float[Tensor, " n"], journey: Int[Tensor, " n"], journeys: int, length_m: float
+) -> Bool[Tensor, " j"]:
+    """True for the journeys whose bias wanders within what was driven."""
+    low, high = group_range(way, journey, journeys)
+    return high - low >= LEAST_SHARE * length_m
+
+
+def bias_wander(
+    sigma: Float[Tensor, "j 3"],
+    is_long: Bool[Tensor, " j"],
+    journey: Int[Tensor, " n"],
+    way: Float[Tensor, " n"],
+    length_m: float,
+) -> BiasWander:
+    """The prior of journeys of which those that are long wander by `sigma`, by journey and way of their nodes."""
+    far = nodes_apart(journey, way, _LAG * length_m)
+    far = far[is_long[journey[far[:, 0]]]]
+    return BiasWander(torch.where(is_long[:, None], sigma, _AT_REST_M), is_long, length_m, far)
+
+
+def nodes_apart(
+    journey: Int[Tensor, " n"], way: Float[Tensor, " n"], lag_m: float
+) -> Int[Tensor, "q 2"]:
+    """The first nodes of successive stretches of `lag_m` metres of each journey."""
+    begins = torch.ones_like(journey, dtype=torch.bool)
+    begins[1:] = journey[1:] != journey[:-1]
+    first = torch.nonzero(begins)[:, 0]
+    cell = ((way - way[first][begins.cumsum(0) - 1]) / lag_m).floor()
+    begins[1:] |= cell[1:] != cell[:-1]
+    at = torch.nonzero(begins)[:, 0]
+    same = journey[at[1:]] == journey[at[:-1]]
+    return torch.stack((at[:-1], at[1:]), dim=1)[same]
+
+
+def first_wander(
+    error: Float[Tensor, "n 3"],
+    way: Float[Tensor, " n"],
+    journey: Int[Tensor, " n"],
+    wander: BiasWander,
+) -> Float[Tensor, "n 3"]:
+    """Where the process may begin: the positions' `error` averaged over stretches of some hundred metres, less its mean."""
+    is_long, length_m = wander.is_long, wander.length_m
+    cell = (way / (_START * length_m)).floor().long()
+    _, of_node = torch.unique_consecutive(torch.stack((journey, cell)), dim=1, return_inverse=True)
+    count = torch.bincount(of_node)[:, None]
+    mean = error.new_zeros(len(count), 3).index_add_(0, of_node, error) / count
+    centre = way.new_zeros(len(count)).index_add_(0, of_node, way) / count[:, 0]
+    owner = torch.zeros_like(of_node[: len(count)]).index_copy_(0, of_node, journey)
+    # Journeys one behind the other, far enough apart that no place lies between two of them.
+    apart = way.max() + 2 * length_m if len(way) else 0.0
+    at, place = owner * apart + centre, journey * apart + way
+    after = torch.searchsorted(at, place).clamp(1, max(len(at) - 1, 1)).clamp_max(len(at) - 1)
+    before = (after - 1).clamp_min(0)
+    before = torch.where(owner[before] == journey, before, after)
+    after = torch.where(owner[after] == journey, after, before)
+    share = ((place - at[before]) / (at[after] - at[before]).clamp_min(1e-9)).clamp(0, 1)[:, None]
+    smooth = torch.lerp(mean[before], mean[after], share)
+    total = smooth.new_zeros(len(is_long), 3).index_add_(0, journey, smooth)
+    total = total / torch.bincount(journey, minlength=len(is_long)).clamp_min(1)[:, None]
+    return (smooth - total[journey]) * is_long[journey, None]
