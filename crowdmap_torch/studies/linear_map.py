@@ -259,6 +259,9 @@ def _pose_covariance(way: Float[Tensor, " f"], config: PositioningConfig) -> Flo
     turn = turn + math.radians(config.white_rot_deg) ** 2 * eye
     bias = (config.bias_e_m, config.bias_n_m, config.bias_u_m)
     white = (config.white_e_m, config.white_n_m, config.white_u_m)
+    if config.bias_wander_m:
+        wander = torch.exp(-apart / config.bias_wander_length_m)
+        drift = drift + config.bias_wander_m**2 * wander
     axes = [b**2 + drift + w**2 * eye for b, w in zip(bias, white, strict=True)] + [turn] * 3
     joint = way.new_zeros(len(way), 6, len(way), 6)
     for k, axis in enumerate(axes):

@@ -97,7 +97,7 @@ def measure_map(
     outliers = [journeys[found.journey].journey_id for found in first.crowd.report.outlier_journeys]
     label = first.crowd.label
     measured = {
-        "heads": _figures(drives, certain_part(hd_map, config.min_confidence), associations),
+        "heads": map_figures(drives, certain_part(hd_map, config.min_confidence), associations),
         "average": plain(averaged_signs(drives, maps, observable)),
         # The paper's own measure of data loss: signs of single journeys, and those that clustering left out.
         "clusters": {"signs": len(label), "left_out": int((label < 0).sum())},
@@ -116,7 +116,7 @@ def measure_map(
     seconds["adjusted"] = time.process_time() - begun
     names = tuple(drives.survey.sign_id[row] for row in pins.tolist())
     final = certain_part(result.hd_map, config.min_confidence)
-    measured["map"] = _figures(drives, final, result.associations, names)
+    measured["map"] = map_figures(drives, final, result.associations, names)
     measured["control_points"] = result.control_points
     measured["shared_covariance"] = final.shared_covariance.tolist()
     return measured
@@ -148,6 +148,8 @@ def shared_part(
         shift += truth.mean_error_m / len(journeys)
         slow = variance_of_mean(truth.way_m.sum() / positioning.drift_length_m)
         own = shift.new_tensor(bias).square() + positioning.drift_m**2 * slow
+        slow = variance_of_mean(truth.way_m.sum() / positioning.bias_wander_length_m)
+        own = own + positioning.bias_wander_m**2 * slow
         variance += own / len(journeys) ** 2
     expected = torch.linalg.solve(covariance, torch.diag(variance)).trace()
     return {
@@ -193,7 +195,7 @@ def spread_signs(survey: Survey, among: Bool[Tensor, " n"], count: int) -> Int[T
     return rows[torch.tensor(chosen, dtype=torch.int64)]
 
 
-def _figures(
+def map_figures(
     drives: Drives,
     hd_map: HdMap,
     associations: Sequence[Association],

@@ -68,6 +68,21 @@ class Scale:
     """Errors that are looked at alone; None: all."""
     fleet_factors: int = 2
     """How many of their sizes."""
+    long_lengths_m: tuple[float, ...] = (1000.0, 20000.0)
+    """Drives whose bias wanders, short and long."""
+    long_share: float = 1.0
+    """Of shorter drives as many maps are made as there is way in a long one, times this."""
+    long_journeys: int = 5
+    series_lengths_m: tuple[float, ...] = (
+        1000.0,
+        2000.0,
+        5000.0,
+        10000.0,
+        20000.0,
+        50000.0,
+        100000.0,
+    )
+    """One drive, longer and longer."""
     linear_sets: int = 8
     """Those of them that the linear estimator is given too."""
     draws: int = 3
@@ -111,6 +126,18 @@ class Scale:
             seed=seed,
         )
 
+    def long_drives(self, length_m: float, seed: int) -> SimulationConfig:
+        """Drives of such a length whose bias wanders by a metre over three kilometres; of signs alone."""
+        simulation = SimulationConfig(
+            world=replace(self.road, length_m=length_m),
+            vehicle=self.vehicle,
+            rig=self.rig,
+            positioning=replace(POSITIONING_PRESETS["paper"], bias_wander_m=1.0),
+            journeys=self.long_journeys,
+            seed=seed,
+        )
+        return without_lanes(simulation)
+
 
 def without_lanes(simulation: SimulationConfig) -> SimulationConfig:
     """The same drives, their lane detector switched off."""
@@ -148,6 +175,10 @@ QUICK = Scale(
     whole_fleet_seeds=1,
     fleet_errors=1,
     fleet_factors=1,
+    long_lengths_m=(60.0, 120.0),
+    long_share=0.1,
+    long_journeys=2,
+    series_lengths_m=(60.0, 120.0),
     linear_sets=1,
     draws=1,
     noise_steps=1,
