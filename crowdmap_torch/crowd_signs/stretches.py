@@ -13,7 +13,7 @@ from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
 from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
 from crowdmap_torch.noise.positioning import PositioningNoise
 
-_STRETCH = 1 / 3
+_STRETCH = 1 / 10
 """Of the way on which a bias forgets where it was: the most that it is taken to stand still over."""
 
 

@@ -22,8 +22,8 @@ from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
 from crowdmap_torch.noise.positioning import PositioningNoise
 
 # The street is short, and so is the way on which a bias forgets where it was.
-WANDERS = PositioningNoise(wander_length_m=600.0)
-STANDS = PositioningNoise()
+WANDERS = PositioningNoise(wander_length_m=1500.0)
+STANDS = PositioningNoise(wander_sigma_m=0.0)
 
 
 def wandering_world(seed: int, *, wander_m: float) -> World:
@@ -65,7 +65,7 @@ def test_of_short_drives_the_vote_is_that_of_whole_drives():
     whole = vote_biases(
         crowd.signs, VoteConfig(), journeys=5, bias_sigma=crowd.bias_sigma, generator=generator
     )
-    found = voted(make_world(0, journeys=5), STANDS)
+    found = voted(make_world(0, journeys=5), PositioningNoise())
     assert torch.equal(found.translation, whole) and not found.node_drift.any()
 
 
