@@ -219,9 +219,9 @@ def _map(
         metrics = metrics_of(dataset, result, config, watch.iterations, progress.seconds, *compared)
         folder.write_metrics({**metrics, "area": plain(given.cut), "warnings": plain(warnings)})
         with _spared("report"):
-            folder.write_outcomes(sign_outcomes(dataset, result, bundle, config))
-            known = (progress.seconds, survey, truth, *compared)
-            record = record_of(dataset, result, config, watch, *known, warnings=warnings)
+            outcomes = folder.keep_outcomes(sign_outcomes(dataset, result, bundle, config))
+            known = (progress.seconds, survey, truth, *compared, warnings, outcomes)
+            record = record_of(dataset, result, config, watch, *known)
             write_report(folder.unfinished / folder.report.name, record)
     kept.finish()
     print(counts_line(dataset, result, config))

@@ -63,110 +63,21 @@ tr.pick { cursor:pointer; }
 .warn { border-left:4px solid var(--before); }
 pre { margin:0; font:12.5px/1.5 ui-monospace,Menlo,Consolas,"DejaVu Sans Mono",monospace;
   overflow:auto; max-height:460px; }
-.map { position:relative; padding:0; overflow:hidden; }
-.map > svg:first-child { display:block; width:100%; height:540px; background:#fcfdfe; cursor:grab;
-  touch-action:none; }
-.map > svg:first-child:active { cursor:grabbing; }
-.map g path { vector-effect:non-scaling-stroke; fill:none; }
-.map g circle { r:calc(var(--k) * var(--r) * 1px); vector-effect:non-scaling-stroke; }
-.map g circle:hover { r:calc(var(--k) * var(--r) * 1.5px); }
-.map .layers { position:absolute; left:12px; top:12px; background:#ffffffee; padding:8px 12px;
-  border:1px solid var(--line); border-radius:8px; font-size:13px; }
-.map .layers label { display:block; cursor:pointer; }
-.map .layers em { display:inline-block; width:16px; height:4px; border-radius:2px;
-  margin:0 7px 3px 4px; }
-.map .buttons { position:absolute; right:12px; top:12px; display:flex; gap:6px; }
-.map button { border:1px solid var(--line); background:#fff; border-radius:7px; height:32px;
-  min-width:32px; font:inherit; cursor:pointer; }
-.map .scale { position:absolute; right:14px; bottom:12px; border-bottom:2px solid var(--ink);
-  border-left:2px solid var(--ink); border-right:2px solid var(--ink); height:7px;
-  pointer-events:none; }
-.map .scale span { position:absolute; left:0; right:0; bottom:8px; text-align:center;
-  font-size:12px; white-space:nowrap; }
-.map .north { height:34px; width:34px; font:600 11px sans-serif; position:absolute; right:18px;
-  top:56px; fill:var(--ink);
-  pointer-events:none; }
-.map .tip { position:absolute; left:12px; bottom:10px; font-size:13px; color:var(--soft);
-  background:#ffffffdd; padding:1px 6px; border-radius:5px; pointer-events:none; }
 footer { color:var(--soft); font-size:13px; padding:32px 0 40px; }
-@media print { nav,.map .buttons,.map .layers { display:none; } .scroll { max-height:none; } }
+@media print { nav { display:none; } .scroll { max-height:none; } }
 """
 
 SCRIPT = """
 (function () {
   'use strict';
-  var map = document.querySelector('.map');
-  if (map) {
-    var svg = map.querySelector('svg'), tip = map.querySelector('.tip');
-    var scale = map.querySelector('.scale');
-    var home = svg.getAttribute('viewBox').split(' ').map(Number), box = home.slice();
-    var show = function () {
-      svg.setAttribute('viewBox', box.join(' '));
-      var perPixel = Math.max(box[2] / svg.clientWidth, box[3] / svg.clientHeight);
-      svg.style.setProperty('--k', perPixel);
-      var power = Math.pow(10, Math.floor(Math.log10(120 * perPixel)));
-      var steps = [5, 2, 1], length = power;
-      for (var k = 0; k < 3; k++) {
-        if (steps[k] * power <= 120 * perPixel) { length = steps[k] * power; break; }
-      }
-      scale.style.width = (length / perPixel) + 'px';
-      scale.firstElementChild.textContent = length >= 1000 ? length / 1000 + ' km' : length + ' m';
-    };
-    var world = svg.querySelector('#world');
-    var at = function (event, element) {
-      var point = new DOMPoint(event.clientX, event.clientY);
-      return point.matrixTransform((element || svg).getScreenCTM().inverse());
-    };
-    var zoom = function (factor, x, y) {
-      factor = Math.min(Math.max(factor, 2 / box[2]), 4 * home[2] / box[2]);
-      box = [x + (box[0] - x) * factor, y + (box[1] - y) * factor,
-             box[2] * factor, box[3] * factor];
-      show();
-    };
-    svg.addEventListener('wheel', function (event) {
-      event.preventDefault();
-      var p = at(event);
-      zoom(Math.exp(event.deltaY * 0.0015), p.x, p.y);
-    }, { passive: false });
-    var from = null;
-    svg.addEventListener('pointerdown', function (event) {
-      from = at(event);
-      svg.setPointerCapture(event.pointerId);
-    });
-    svg.addEventListener('pointermove', function (event) {
-      var p = at(event);
-      if (from) { box[0] += from.x - p.x; box[1] += from.y - p.y; show(); }
-      p = at(event, world);
-      tip.textContent = 'east ' + p.x.toFixed(1) + ' m, north ' + (-p.y).toFixed(1) + ' m';
-    });
-    ['pointerup', 'pointercancel'].forEach(function (name) {
-      svg.addEventListener(name, function () { from = null; });
-    });
-    map.querySelectorAll('button').forEach(function (button) {
-      button.addEventListener('click', function () {
-        var factor = Number(button.dataset.zoom);
-        if (factor) { zoom(factor, box[0] + box[2] / 2, box[1] + box[3] / 2); }
-        else { box = home.slice(); show(); }
-      });
-    });
-    map.querySelectorAll('input').forEach(function (input) {
-      input.addEventListener('change', function () {
-        svg.getElementById(input.value).style.display = input.checked ? '' : 'none';
-      });
-    });
-    document.querySelectorAll('tr.pick').forEach(function (row) {
-      row.addEventListener('click', function () {
-        var wide = 40, high = wide * home[3] / home[2];
-        var turn = svg.getScreenCTM().inverse().multiply(world.getScreenCTM());
-        var p = new DOMPoint(row.dataset.x, -row.dataset.y).matrixTransform(turn);
-        box = [p.x - wide / 2, p.y - high / 2, wide, high];
-        show();
+  document.querySelectorAll('tr.pick').forEach(function (row) {
+    row.addEventListener('click', function () {
+      var viewer = document.getElementById('crowdmap-viewer').viewer;
+      if (viewer && viewer.chooseSign(row.dataset.id)) {
         document.getElementById('map').scrollIntoView();
-      });
+      }
     });
-    window.addEventListener('resize', show);
-    show();
-  }
+  });
   document.querySelectorAll('table.sortable').forEach(function (table) {
     var heads = Array.from(table.tHead.rows[0].cells), body = table.tBodies[0];
     heads.forEach(function (head, column) {

@@ -12,7 +12,7 @@ from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.report import plots
 from crowdmap_torch.report.assets import SCRIPT, STYLE
 from crowdmap_torch.report.calibration import calibration_table, plot_calibration
-from crowdmap_torch.report.map_svg import map_svg
+from crowdmap_torch.report.map_section import map_section
 from crowdmap_torch.report.record import RunRecord
 from crowdmap_torch.report.tables_html import (
     bias_table,
@@ -59,8 +59,10 @@ def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
     """Anchor, title and content of each section; those without content are left out."""
     yield "warnings", "Looks wrong", _warnings(record)
     yield "headline", "At a glance", headline_cards(record)
-    told = note("From above. A click on a row of the table of signs brings it here.")
-    yield "map", "Map", told + map_svg(record)
+    told = note(
+        "A click shows what is known of a sign. A row of the table of signs leads here too."
+    )
+    yield "map", "Map", told + map_section(record)
     yield "errors", "Errors", _errors(record)
     yield "journeys", "Journeys", _journeys(record)
     yield "calibration", "Calibration", _calibration(record)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from crowdmap_torch.config import MapperConfig, dump
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.signs import SignComparison
 from crowdmap_torch.io.maps import certain_part
+from crowdmap_torch.io.sign_outcomes import NamedOutcomes
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.plausibility.finding import Finding
@@ -31,6 +32,7 @@ from crowdmap_torch.report.summaries import (
 )
 from crowdmap_torch.report.watch import Watch
 from crowdmap_torch.tables import Dataset, HdMap, RejectedJourney, Survey
+from crowdmap_torch.viewer.scene import Drive
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,10 @@ class RunRecord:
     survey: Survey | None = None
     figures: MapFigures | None = None
     figures_before: MapFigures | None = None
-    paths_world: Mapping[str, Float[Tensor, "f 3"]] = field(default_factory=dict)
-    """Where the cars drove, by journey."""
+    drives: tuple[Drive, ...] = ()
+    """Where the cars drove, as given and after the adjustment."""
+    outcomes: NamedOutcomes | None = None
+    """What became of every sign detection."""
     journeys: tuple[JourneySummary, ...] = ()
     counts: Mapping[str, float | str] = field(default_factory=dict)
     """Stages' counts by name, in the order of the stages."""
@@ -94,11 +98,13 @@ def record_of(
     figures: MapFigures | None,
     figures_before: MapFigures | None,
     warnings: Sequence[Finding] = (),
+    outcomes: NamedOutcomes | None = None,
 ) -> RunRecord:
     """What report.html is drawn from."""
     hd_map, before = (
         certain_part(m, config.min_confidence) for m in (result.hd_map, result.map_clusters)
     )
+    summaries = journey_summaries(dataset, result, truth)
     return RunRecord(
         title=f"Map of {len(dataset.journeys)} journeys",
         hd_map=hd_map,
@@ -106,11 +112,9 @@ def record_of(
         survey=survey,
         figures=figures,
         figures_before=figures_before,
-        paths_world={
-            journey.journey_id: poses[:, :3, 3]
-            for journey, poses in zip(dataset.journeys, result.poses, strict=True)
-        },
-        journeys=journey_summaries(dataset, result, truth),
+        drives=tuple(_drives(dataset, result, summaries)),
+        outcomes=outcomes,
+        journeys=summaries,
         counts=counts_of(dataset, result, config),
         pruned=pruned_of(dataset, result, config),
         warnings=tuple(warnings),
@@ -125,3 +129,23 @@ def record_of(
         timings_s=dict(seconds),
         config_yaml=dump(config),
     )
+
+
+def _drives(
+    dataset: Dataset, result: MapResult, summaries: Sequence[JourneySummary]
+) -> Iterator[Drive]:
+    """Every journey's way, as given and as adjusted."""
+    why = {out.journey_id: out.reason for out in outlier_journeys_of(dataset, result.first)}
+    for journey, poses, summary in zip(dataset.journeys, result.poses, summaries, strict=True):
+        yield Drive(
+            journey_id=journey.journey_id,
+            frame_number=journey.frame_number,
+            t_ns=journey.t_ns,
+            path_world=poses[:, :3, 3],
+            given_world=journey.T_world_camera[:, :3, 3],
+            vehicle=journey.vehicle,
+            image=(journey.rig.camera.width, journey.rig.camera.height),
+            bias=summary.bias,
+            bias_sigma=summary.bias_sigma,
+            remark=why.get(journey.journey_id, ""),
+        )

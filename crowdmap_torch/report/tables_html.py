@@ -185,8 +185,8 @@ def sign_table(record: RunRecord) -> str:
             tag = f'<span class="tag {status[k]}">{status[k]}</span>'
             cells.append(f'<td class="text" data-v="{status[k]}">{tag}</td>')
             cells += [_cell(number_text(e), e) for e in (absolute[k], relative[k])]
-        place = f'data-x="{center[k][0]:.2f}" data-y="{center[k][1]:.2f}"'
-        rows.append(f'<tr class="pick" {place}>{"".join(cells)}</tr>')
+        key = escape(hd_map.sign_id[k])
+        rows.append(f'<tr class="pick" data-id="{key}">{"".join(cells)}</tr>')
     note = ""
     if len(signs) > _MAX_SIGNS:
         note = f'<p class="note">The first {_MAX_SIGNS:,} of {len(signs):,} signs.</p>'

@@ -171,9 +171,10 @@ class RunFolder:
                 min_confidence=config.min_confidence,
             )
 
-    def write_outcomes(self, outcomes: NamedOutcomes) -> None:
-        """sign_detections.parquet."""
+    def keep_outcomes(self, outcomes: NamedOutcomes) -> NamedOutcomes:
+        """Writes sign_detections.parquet, and hands on what it holds."""
         write_sign_outcomes(self.unfinished / "sign_detections.parquet", outcomes)
+        return outcomes
 
     def write_metrics(self, metrics: Mapping[str, object]) -> None:
         """metrics.json."""

@@ -10,6 +10,7 @@ from crowdmap_torch.report.plots import Eigengap
 from crowdmap_torch.report.record import RunRecord
 from crowdmap_torch.report.summaries import JourneySummary, OutageSummary, Pruned
 from crowdmap_torch.tables import RejectedJourney
+from crowdmap_torch.viewer.scene import Drive
 
 
 @pytest.fixture(scope="session")
@@ -47,7 +48,10 @@ def record(build: Builder) -> RunRecord:
         survey=survey,
         figures=evaluate_map(hd_map, survey),
         figures_before=evaluate_map(before, survey),
-        paths_world={"a": build.straight(1.5), "b": build.straight(1.8)},
+        drives=tuple(
+            Drive(name, torch.arange(11), torch.arange(11) * 10**8, build.straight(y))
+            for name, y in (("a", 1.5), ("b", 1.8))
+        ),
         journeys=(
             JourneySummary(
                 "a",

@@ -26,11 +26,11 @@ def test_a_record_holds_every_journey_and_certain_signs_alone(
     made: RunRecord, tiny: Dataset, tiny_result: MapResult
 ):
     assert [j.journey_id for j in made.journeys] == [j.journey_id for j in tiny.journeys]
-    assert list(made.paths_world) == [j.journey_id for j in tiny.journeys]
+    assert [drive.journey_id for drive in made.drives] == [j.journey_id for j in tiny.journeys]
     assert (made.hd_map.signs.confidence >= MapperConfig().min_confidence).all()
     assert len(made.hd_map.signs) <= len(tiny_result.hd_map.signs)
-    for path, poses in zip(made.paths_world.values(), tiny_result.poses, strict=True):
-        assert torch.equal(path, poses[:, :3, 3])
+    for drive, poses in zip(made.drives, tiny_result.poses, strict=True):
+        assert torch.equal(drive.path_world, poses[:, :3, 3])
 
 
 def test_eigenvalues_ascend_to_beyond_the_gap(made: RunRecord):

@@ -99,5 +99,5 @@ def run_folder(
         folder.write_result(tiny, result, config)
         with folder.publishing():
             folder.write_metrics(metrics_of(tiny, result, config, (), {}, None, None))
-            folder.write_outcomes(sign_outcomes(tiny, result, bundle, config))
+            folder.keep_outcomes(sign_outcomes(tiny, result, bundle, config))
     return folder.path

@@ -254,7 +254,7 @@ function boundsOf(model) {
     z += height; n++;
   };
   const ofMap = model.signs.length + model.lanes.length;
-  for (const sign of model.signs) add(sign.x, sign.y, sign.ground);
+  for (const sign of ofMap ? model.signs : model.survey) add(sign.x, sign.y, sign.ground);
   for (const line of ofMap ? model.lanes : [...model.paths, ...model.surveyLanes]) {
     for (let k = 0; k < line.points.length; k += 3) add(line.points[k], line.points[k + 1], line.points[k + 2]);
   }
