@@ -16,7 +16,7 @@ from worlds.pretend_device import DEVICE, PretendTensor, Transfers, pretend_devi
 from crowdmap_torch import cli, mapper
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.config import MapperConfig
-from crowdmap_torch.evaluation.evaluate import evaluate_map, progress_scalars
+from crowdmap_torch.evaluation.evaluate import against, evaluate_map, progress_scalars
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.io.surveys import read_survey
@@ -161,9 +161,9 @@ def test_maps_on_a_device_are_judged_beside_a_survey_on_the_cpu(
     figures = evaluate_map(clusters, survey, truth=truth)
     same = evaluate_map(to_device(clusters, "cpu"), survey, truth=truth)
     assert figures.signs.absolute == same.signs.absolute
-    scalars = progress_scalars(heads.signs, survey, lanes=heads.lanes)
+    scalars = progress_scalars(heads.signs, against(survey), lanes=heads.lanes)
     signs, lanes = to_device((heads.signs, heads.lanes), "cpu")
-    assert scalars == progress_scalars(signs, survey, lanes=lanes)
+    assert scalars == progress_scalars(signs, against(survey), lanes=lanes)
 
 
 class AtOnce:

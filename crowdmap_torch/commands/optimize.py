@@ -16,6 +16,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypedDict
 
@@ -24,10 +25,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 
-from crowdmap_torch import mapper
+from crowdmap_torch import __version__, mapper
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.config import MapperConfig, dump, load_config
+from crowdmap_torch.evaluation.evaluate import against, control_ids_of
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
 from crowdmap_torch.io.area import Area, Cut, cut_dataset, cut_truth, read_area
@@ -186,7 +188,7 @@ def _map(
         # ---- everything at once (section V-B) ----
         progress("bundle adjustment: building")
         bundle = mapper.build_bundle(journeys, maps, first, config, **given.beside(device))
-        watch = Watch(log, survey, first.signs, first.lanes, every=options.log_every)
+        watch = given.watch(log, first, config, every=options.log_every)
         step = found.step
         begun = adjust.start(bundle) if step is None else adjust.go_on(bundle, step.standing)
         if found.start is None:
@@ -221,7 +223,7 @@ def _map(
         with _spared("report"):
             outcomes = folder.keep_outcomes(sign_outcomes(dataset, result, bundle, config))
             known = (progress.seconds, survey, truth, *compared, warnings, outcomes)
-            record = record_of(dataset, result, config, watch, *known)
+            record = record_of(dataset, result, config, watch, *known, _facts(options, given.cut))
             write_report(folder.unfinished / folder.report.name, record)
     kept.finish()
     print(counts_line(dataset, result, config))
@@ -255,6 +257,19 @@ class _Given:
     """What an earlier run found of their calibrations."""
     cut: Cut | None
     """What `--bbox` left out."""
+
+    def watch(
+        self, log: TensorBoardLog, first: mapper.FirstMap, config: MapperConfig, *, every: int
+    ) -> Watch:
+        """What watches the adjustment, with errors against what is asked of the finished map."""
+        asked = None
+        if self.survey is not None:
+            known = () if self.control is None else control_ids_of(self.control, self.survey)
+            area = None if self.cut is None else Area(*self.cut.bbox)
+            truth = to_device(self.truth, "cpu")
+            asked = against(self.survey, truth=truth, control_ids=known, area=area)
+        least = config.min_confidence
+        return Watch(log, asked, first.signs, first.lanes, every=every, min_confidence=least)
 
     def beside(self, device: torch.device) -> _Beside:
         """What is known beside the drives, for the bundle."""
@@ -343,6 +358,18 @@ def _compared(
     figures = figures_of(final, survey, truth, folder.unfinished, control)
     print(format_figures(figures))
     return figures, figures_of(before, survey, truth, None, control)
+
+
+def _facts(options: argparse.Namespace, cut: Cut | None) -> dict[str, str]:
+    """What a report says at its head of what was mapped, when and with what."""
+    facts = {
+        "data set": str(options.dataset.resolve()),
+        "mapped": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "with": f"crowdmap {__version__}",
+    }
+    if options.config is not None:
+        facts["configuration"] = str(options.config)
+    return facts if cut is None else {**facts, "cut to": str(cut)}
 
 
 def _area(text: str) -> Area:

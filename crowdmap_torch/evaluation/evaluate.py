@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from crowdmap_torch.evaluation.association import evaluate_association
@@ -31,7 +32,7 @@ from crowdmap_torch.evaluation.single_journey import (
 )
 from crowdmap_torch.evaluation.uncertainty import evaluate_uncertainty
 from crowdmap_torch.evaluation.visibility import observable_signs, oracle_figures, seen_by_journeys
-from crowdmap_torch.io.area import area_of
+from crowdmap_torch.io.area import Area, area_of
 from crowdmap_torch.io.truth import SignAssociations, Truth
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.survey.matching import SurveyMatchConfig
@@ -39,6 +40,48 @@ from crowdmap_torch.tables import HdMap, Lanes, Origin, Signs, Survey, to_device
 
 _CONTROL_GATE_M = 1.0
 """A control sign without the survey's id is the survey's sign this near to it."""
+
+
+@dataclass(frozen=True)
+class Against:
+    """A survey, and what of it is asked of a map: the same for every figure, of a finished map and of one in the making."""
+
+    survey: Survey
+    observable: Bool[Tensor, " n"] | None
+    """By sign; None: every one."""
+    control: Bool[Tensor, " n"]
+    """Signs that are left out of every figure."""
+    lanes_seen_by: Int[Tensor, " p"] | None
+    """By sample of `survey_samples`, how many journeys have seen it; None: all count."""
+
+
+def against(
+    survey: Survey,
+    *,
+    truth: Truth | None = None,
+    control_ids: Collection[str] = (),
+    observable_ids: Collection[str] | None = None,
+    area: Area | None = None,
+) -> Against:
+    """What is asked of a map: `observable_ids`, else what the journeys of `truth` have seen, else all.
+
+    Of it what stands in `area`. ValueError for an id that the survey has not.
+    """
+    config = LaneEvaluationConfig()
+    samples = survey_samples(survey, config.step_m)
+    observable = lanes_seen = None
+    if truth is not None:
+        lanes_seen = seen_by_journeys(truth, samples)
+    if observable_ids is not None:
+        observable = _rows_named(survey, observable_ids, "observable")
+    elif truth is not None:
+        observable = observable_signs(truth, survey.signs)
+    if area is not None:
+        inside = area.holds(survey.signs.center_world)
+        observable = inside if observable is None else observable & inside
+        inside = area.holds(samples.point_world).long()
+        lanes_seen = inside * (config.min_journeys if lanes_seen is None else lanes_seen)
+    return Against(survey, observable, _rows_named(survey, control_ids, "control"), lanes_seen)
 
 
 @one_core_each()
@@ -66,18 +109,19 @@ def evaluate_map(
     hd_map, survey, truth = to_device((hd_map, survey, truth), "cpu")
     associations, landmarks = to_device((associations, landmarks), "cpu")
     config = SignEvaluationConfig(match=SurveyMatchConfig(gate_m=gate_m))
-    observable = None
-    if observable_ids is not None:
-        observable = _rows_named(survey, observable_ids, "observable")
-    elif truth is not None:
-        observable = observable_signs(truth, survey.signs)
-    area = area_of(hd_map.provenance)
-    if area is not None:
-        inside = area.holds(survey.signs.center_world)
-        observable = inside if observable is None else observable & inside
-    control = _rows_named(survey, control_ids, "control")
+    asked = against(
+        survey,
+        truth=truth,
+        control_ids=control_ids,
+        observable_ids=observable_ids,
+        area=area_of(hd_map.provenance),
+    )
     comparison = compare_signs(
-        hd_map.signs, survey.signs, observable=observable, control=control, config=config
+        hd_map.signs,
+        survey.signs,
+        observable=asked.observable,
+        control=asked.control,
+        config=config,
     )
     signs = sign_figures(comparison, survey.signs, config)
     oracle = oracle_center = None
@@ -90,7 +134,7 @@ def evaluate_map(
         absolute_over_oracle=signs.absolute.total.mean / oracle.total.mean
         if oracle is not None and oracle.total.mean > 0
         else math.nan,
-        lanes=_evaluate_lanes(hd_map, survey, truth, comparison.match.shift),
+        lanes=_evaluate_lanes(hd_map, asked, comparison.match.shift),
         association=evaluate_association(associations, truth, comparison.observable)
         if associations is not None and truth is not None
         else None,
@@ -128,19 +172,13 @@ def control_ids_of(control: Survey, survey: Survey) -> tuple[str, ...]:
 
 
 def progress_scalars(
-    signs: Signs,
-    survey: Survey,
-    *,
-    lanes: Lanes | None = None,
-    observable: Bool[Tensor, " n"] | None = None,
-    control: Bool[Tensor, " n"] | None = None,
-    gate_m: float = 3.0,
+    signs: Signs, asked: Against, *, lanes: Lanes | None = None
 ) -> dict[str, float]:
-    """Errors of an unfinished map by TensorBoard tag, cheap enough for every iteration."""
-    config = SignEvaluationConfig(match=SurveyMatchConfig(gate_m=gate_m))
+    """Errors of an unfinished map by TensorBoard tag: METRICS.md's figures, as `evaluate_map` has them of a finished one."""
     signs, lanes = to_device(signs, "cpu"), to_device(lanes, "cpu")
+    survey = asked.survey
     figures = evaluate_signs(
-        signs, survey.signs, observable=observable, control=control, config=config
+        signs, survey.signs, observable=asked.observable, control=asked.control
     )
     scalars = {
         "error/corner_m": figures.absolute.total.mean,
@@ -154,9 +192,7 @@ def progress_scalars(
     }
     if lanes is not None and len(survey.lane_id):
         shift = torch.tensor(figures.median_shift).to(signs.T_world_sign)
-        found = evaluate_lanes(
-            lanes, survey, shift=shift, config=LaneEvaluationConfig(step_m=2.0, width_step_m=10.0)
-        )
+        found = evaluate_lanes(lanes, survey, seen_by=asked.lanes_seen_by, shift=shift)
         scalars["error/lane_lateral_m"] = found.lateral.mean
         scalars["error/lane_lateral_without_shift_m"] = found.lateral_without_shift.mean
         scalars["error/lane_recall"] = found.recall
@@ -182,27 +218,15 @@ def _rows_named(survey: Survey, ids: Collection[str], what: str) -> Bool[Tensor,
     )
 
 
-def _evaluate_lanes(
-    hd_map: HdMap, survey: Survey, truth: Truth | None, shift: Tensor
-) -> LaneFigures | None:
-    if not len(survey.lane_points):
+def _evaluate_lanes(hd_map: HdMap, asked: Against, shift: Tensor) -> LaneFigures | None:
+    if not len(asked.survey.lane_points):
         return None
-    config = LaneEvaluationConfig()
-    seen_by = None
-    samples = survey_samples(survey, config.step_m)
-    if truth is not None:
-        seen_by = seen_by_journeys(truth, samples)
-    area = area_of(hd_map.provenance)
-    if area is not None:
-        inside = area.holds(samples.point_world).long()
-        seen_by = inside * (config.min_journeys if seen_by is None else seen_by)
     return evaluate_lanes(
         hd_map.lanes,
-        survey,
-        seen_by=seen_by,
+        asked.survey,
+        seen_by=asked.lanes_seen_by,
         shift=shift,
         shared_covariance=hd_map.shared_covariance,
-        config=config,
     )
 
 

@@ -81,6 +81,11 @@ _WHY: dict[str, tuple[str, str]] = {
 _UNKNOWN = ("detections were left out", "see `pruned` in metrics.json")
 
 
+def reason_of(fate: str) -> tuple[str, str]:
+    """Likely cause and cure, where most detections have a fate."""
+    return _WHY.get(fate, _UNKNOWN)
+
+
 def sign_fates(dataset: Dataset, result: MapResult, config: MapperConfig) -> Counter[str]:
     """Where the sign detections of all files ended; the counts add up to their rows."""
     total = _dropped(dataset, DROPPED_SIGN)
@@ -148,7 +153,7 @@ def _missing(fates: Mapping[str, Counter[str]]) -> Iterator[Finding]:
             continue
         ordered = count.most_common()
         told = ", ".join(f"{number:,} {fate}" for fate, number in ordered)
-        cause, cure = _WHY.get(ordered[0][0], _UNKNOWN)
+        cause, cure = reason_of(ordered[0][0])
         yield Finding(
             f"no-{kind}s",
             f"the map has no {kind}s, of {total:,} {kind} detections: {told}",

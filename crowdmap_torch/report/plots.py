@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
@@ -23,8 +22,6 @@ from torch import Tensor
 from crowdmap_torch.evaluation.polyline import lane_samples
 from crowdmap_torch.evaluation.signs import SignComparison
 from crowdmap_torch.io.atomic import atomic_file
-from crowdmap_torch.report.iteration import Iteration
-from crowdmap_torch.report.summaries import JourneySummary
 from crowdmap_torch.tables import Dataset, HdMap, Survey
 
 MAP, SURVEY, BEFORE, WRONG, FAINT, INK = (
@@ -67,6 +64,7 @@ _STYLE: dict[Any, Any] = {
     "ytick.color": "#5b6675",
 }
 
+_PAGE_COLORS = {INK: "ink", "#9aa4b2": "faint", "#e7ebf0": "line", "#5b6675": "soft"}
 
 Plot = TypeVar("Plot", bound=Callable[..., Figure])
 
@@ -123,59 +121,10 @@ def plot(what: HdMap | Dataset, survey: Survey | None = None) -> Figure:
     raise TypeError(f"expected a map or a dataset, found {type(what).__name__}")
 
 
-@styled
-def plot_sign_errors(
-    comparison: SignComparison, before: SignComparison | None = None, *, oracle_m: float = math.nan
-) -> Figure:
-    """Histograms of the absolute and the relative error of signs (`sign_errors`)."""
-    figure, panels = new_figure(2, width=9.0, height=2.9)
-    for axes, name in zip(panels, ("absolute", "relative"), strict=True):
-        now = sign_errors(comparison, name)
-        then = sign_errors(before, name) if before is not None else now[:0]
-        both = torch.cat((now, then))
-        top = float(both.max()) * 1.02 if len(both) else 1.0
-        edges = np.linspace(0, max(top, 1e-3), 25).tolist()
-        if len(then):
-            axes.hist(then.cpu(), edges, color=BEFORE, alpha=0.45, label="cluster heads")
-        axes.hist(now.cpu(), edges, color=MAP, alpha=0.75, label="map")
-        if len(now):
-            axes.axvline(float(now.mean()), color=MAP, lw=1.5, ls="--", label="mean of the map")
-        if name == "absolute" and math.isfinite(oracle_m):
-            axes.axvline(oracle_m, color=INK, lw=1.5, ls=":", label="oracle")
-        axes.set(xlabel="error [m]", ylabel="signs", title=f"{name} error")
-        axes.legend(loc="upper right")
-    return figure
-
-
 def sign_errors(comparison: SignComparison, name: str) -> Float[Tensor, " k"]:
     """The `absolute` or `relative` error of each matched observable sign [m]."""
     c = comparison
     return c.error_m(name)[c.counted & c.has_relative if name == "relative" else c.counted]
-
-
-@styled
-def plot_bias(journeys: Sequence[JourneySummary]) -> Figure:
-    """The bias of each journey from above, and its height; the true one where it is known."""
-    figure, (plan, height) = new_figure(2, width=9.0, height=3.4)
-    bias = np.array([j.bias for j in journeys]).reshape(-1, 3)
-    known = [k for k, j in enumerate(journeys) if j.true_bias is not None]
-    true = np.array([j.true_bias for j in journeys if j.true_bias is not None]).reshape(-1, 3)
-    for row, k in enumerate(known):
-        plan.plot(*np.stack((bias[k, :2], true[row, :2]), axis=-1), color=FAINT, lw=1, zorder=1)
-    plan.plot(true[:, 0], true[:, 1], "o", mfc="none", mec=SURVEY, ms=6, label="true")
-    plan.plot(bias[:, 0], bias[:, 1], ".", color=MAP, ms=7, label="estimated")
-    plan.axhline(0, color=FAINT, lw=0.8)
-    plan.axvline(0, color=FAINT, lw=0.8)
-    plan.set_aspect("equal", adjustable="datalim")
-    plan.set(xlabel="east [m]", ylabel="north [m]", title="bias of each journey")
-    number = np.arange(len(journeys))
-    height.bar(number, bias[:, 2], color=MAP, width=0.6, label="estimated")
-    height.plot(number[known], true[:, 2], "o", mfc="white", mec=SURVEY, ms=6, label="true")
-    height.axhline(0, color=FAINT, lw=0.8)
-    height.set(xlabel="journey", ylabel="up [m]", title="its vertical part")
-    if known:
-        plan.legend(loc="best")
-    return figure
 
 
 @dataclass(frozen=True)
@@ -271,39 +220,15 @@ def plot_residuals_over_image(
     return figure
 
 
-@styled
-def plot_convergence(iterations: Sequence[Iteration]) -> Figure:
-    """Cost of every term, and the error against the survey as it falls, over the iterations."""
-    tags = ("error/corner_m", "error/corner_relative_m", "error/lane_lateral_m")
-    tags = tuple(t for t in tags if any(t in i.errors for i in iterations))
-    figure, panels = new_figure(2 if tags else 1, width=9.0, height=2.9)
-    number = [i.number for i in iterations]
-    terms = list(dict.fromkeys(term for i in iterations for term in i.cost))
-    axes = panels[0]
-    axes.plot(number, [i.total for i in iterations], color=INK, lw=1.8, label="total")
-    for term, color in zip(terms, SERIES * 9, strict=False):
-        axes.plot(number, [i.cost.get(term, math.nan) for i in iterations], color=color, label=term)
-    if any(cost > 0 for i in iterations for cost in i.cost.values()):
-        axes.set_yscale("log")
-    axes.set(xlabel="iteration", ylabel="cost", title="cost")
-    axes.legend(loc="best")
-    for tag, color in zip(tags, SERIES, strict=False):
-        points = [(i.number, i.errors[tag]) for i in iterations if tag in i.errors]
-        name = tag.removeprefix("error/").removesuffix("_m").replace("_", " ")
-        panels[1].plot(*zip(*points, strict=True), color=color, marker=".", label=name)
-    if tags:
-        panels[1].set(xlabel="iteration", ylabel="error [m]", title="error against the survey")
-        panels[1].set_ylim(bottom=0)
-        panels[1].legend(loc="upper right")
-    return figure
-
-
 def svg(figure: Figure) -> str:
     """A figure as an SVG element that can stand inside HTML."""
     buffer = io.StringIO()
     with mpl.rc_context(_STYLE):
         figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
     text = buffer.getvalue()
+    # Inside a page colours of text and axes are the page's own, and turn with it.
+    for color, name in _PAGE_COLORS.items():
+        text = text.replace(color, f"var(--{name}, {color})")
     return text[text.index("<svg") :]
 
 

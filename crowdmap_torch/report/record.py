@@ -17,6 +17,7 @@ from crowdmap_torch.io.sign_outcomes import NamedOutcomes
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.plausibility.finding import Finding
+from crowdmap_torch.report.drives import CornerResiduals, Drift, corners_of, drifts_of
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.plots import Eigengap
 from crowdmap_torch.report.stages import eigengaps_of
@@ -24,6 +25,7 @@ from crowdmap_torch.report.summaries import (
     JourneySummary,
     OutageSummary,
     Pruned,
+    counts_line,
     counts_of,
     journey_summaries,
     outages_of,
@@ -41,8 +43,8 @@ class RunRecord:
 
     title: str
     hd_map: HdMap
-    subtitle: str = ""
-    """Dataset, version, date: one line."""
+    facts: Mapping[str, str] = field(default_factory=dict)
+    """What stands at its head, by name: data set, date, version, counts."""
     map_before: HdMap | None = None
     """The cluster heads, before bundle adjustment."""
     survey: Survey | None = None
@@ -69,6 +71,9 @@ class RunRecord:
     spectra: tuple[Eigengap, ...] = ()
     residual_px: Mapping[str, Float[Tensor, " n"]] = field(default_factory=dict)
     """Lengths of pixel residuals, by stage, in the order of the stages."""
+    corners: CornerResiduals | None = None
+    """What is left of each corner."""
+    drifts: tuple[Drift, ...] = ()
     iterations: tuple[Iteration, ...] = ()
     outcome: str = ""
     """Why the bundle adjustment stopped."""
@@ -99,14 +104,16 @@ def record_of(
     figures_before: MapFigures | None,
     warnings: Sequence[Finding] = (),
     outcomes: NamedOutcomes | None = None,
+    facts: Mapping[str, str] | None = None,
 ) -> RunRecord:
-    """What report.html is drawn from."""
+    """What report.html is drawn from; `facts` stand at its head before the counts."""
     hd_map, before = (
         certain_part(m, config.min_confidence) for m in (result.hd_map, result.map_clusters)
     )
     summaries = journey_summaries(dataset, result, truth)
     return RunRecord(
         title=f"Map of {len(dataset.journeys)} journeys",
+        facts={**(facts or {}), "from": counts_line(dataset, result, config)},
         hd_map=hd_map,
         map_before=before,
         survey=survey,
@@ -124,6 +131,8 @@ def record_of(
         outages=outages_of(dataset, result.first),
         spectra=eigengaps_of(result.first),
         residual_px=watch.residual_px,
+        corners=None if outcomes is None else corners_of(dataset, result, outcomes),
+        drifts=drifts_of(dataset, result),
         iterations=tuple(watch.iterations),
         outcome=result.state.reasons[0],
         timings_s=dict(seconds),

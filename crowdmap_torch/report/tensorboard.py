@@ -132,6 +132,7 @@ class TensorBoardLog:
         scalars = {f"cost/{term}": cost for term, cost in iteration.cost.items()}
         scalars |= {
             "cost/total": iteration.total,
+            "cost/before": iteration.cost_before,
             "solver/damping": iteration.damping,
             "solver/step_norm": iteration.step_norm,
             "solver/gain_ratio": iteration.gain_ratio,

@@ -13,13 +13,13 @@ from torch import Tensor
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import columns
-from crowdmap_torch.evaluation.evaluate import progress_scalars
+from crowdmap_torch.evaluation.evaluate import Against, progress_scalars
 from crowdmap_torch.optim.levenberg_marquardt import LmState
-from crowdmap_torch.optim.linearize import residuals
+from crowdmap_torch.optim.linearize import residuals, term_costs
 from crowdmap_torch.report import plots
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.tensorboard import TensorBoardLog
-from crowdmap_torch.tables import HdMap, Lanes, Signs, Survey
+from crowdmap_torch.tables import HdMap, Lanes, Signs
 
 _LANES_EVERY = 5
 """Lanes are compared with the survey every this many steps: it takes longer than a step."""
@@ -32,9 +32,10 @@ _MOST_CARS = 12
 
 @dataclass(frozen=True)
 class Residuals:
-    """Lengths of pixel residuals."""
+    """Lengths of pixel residuals before the first step, and the cost there."""
 
     by_stage: Mapping[str, Float[Tensor, " _"]]
+    cost: float
 
 
 @dataclass(frozen=True)
@@ -50,16 +51,21 @@ class Watch:
     def __init__(
         self,
         log: TensorBoardLog,
-        survey: Survey | None,
+        asked: Against | None,
         signs: Signs,
         lanes: Lanes,
         *,
         every: int = 1,
+        min_confidence: float = 0.0,
     ) -> None:
+        """`asked` is what errors are told of; signs below `min_confidence` are not of the map and have none."""
         self.iterations: list[Iteration] = []
         self.residual_px: dict[str, Float[Tensor, " n"]] = {}
         self._log = log
-        self._survey = survey
+        self._asked = asked
+        self._survey = None if asked is None else asked.survey
+        self._certain = signs.confidence >= min_confidence
+        self._cost = math.nan
         self._signs = signs
         self._lanes = lanes
         self._every = max(every, 1)
@@ -71,7 +77,8 @@ class Watch:
         self.residual_px["cluster heads"] = corner_residuals(bundle).norm(dim=-1)
         errors = self._errors(bundle, with_lanes=True)
         self._log.log_scalars(errors, 0)
-        return Residuals(self.residual_px)
+        self._cost = _cost(bundle)
+        return Residuals(self.residual_px, self._cost)
 
     @property
     def course(self) -> Course:
@@ -82,11 +89,13 @@ class Watch:
         """Takes over what another watch saw, up to where it was interrupted."""
         self.residual_px = dict(residuals.by_stage)
         self.iterations = list(course.iterations)
+        self._cost = self.iterations[-1].cost_after if self.iterations else residuals.cost
 
     @torch.no_grad()
     def step(self, number: int, state: LmState, bundle: Bundle) -> None:
         """One step of the solver."""
         looked_at = number % self._every == 0
+        before, self._cost = self._cost, _cost(bundle)
         iteration = Iteration(
             number=number + 1,
             cost={name: float(cost) for name, cost in state.term_cost.items()},
@@ -94,6 +103,10 @@ class Watch:
             gain_ratio=float(state.gain_ratio),
             step_norm=float(state.step_norm),
             accepted=bool(state.accepted),
+            cost_before=before,
+            cost_after=self._cost,
+            scale=_scales(bundle),
+            judged=int(bundle.judged),
             errors=self._errors(bundle, with_lanes=number % _LANES_EVERY == 0) if looked_at else {},
         )
         self.iterations.append(iteration)
@@ -109,9 +122,7 @@ class Watch:
             self._log.log_histogram(f"residual/{name}", squared.sqrt(), number + 1)
             self._log.log_histogram(f"weight/{name}", weight, number + 1)
         self._log.log_iteration(iteration, down_weighted=down_weighted)
-        names = ("sign_px", "lane_px", "lane_correlation")
-        scales = {f"scale/{k}": v for k, v in zip(names, bundle.scale.tolist(), strict=True)}
-        scales["scale/lasting_px"] = math.sqrt(float(bundle.lasting))
+        scales = {f"scale/{name}": value for name, value in iteration.scale.items()}
         self._log.log_scalars(scales, number + 1)
         self._log.log_scalars(dict(_calibration_scalars(bundle)), number + 1)
         if len(bundle.corners):
@@ -136,10 +147,23 @@ class Watch:
             self._log.log_figure(f"residual/over_image_{number}", figure, steps)
 
     def _errors(self, bundle: Bundle, *, with_lanes: bool) -> dict[str, float]:
-        if self._survey is None or not len(self._signs):
+        if self._asked is None or not len(self._signs):
             return {}
         signs, lanes = adjust.read_map(bundle, self._signs, self._lanes)
-        return progress_scalars(signs, self._survey, lanes=lanes if with_lanes else None)
+        return progress_scalars(
+            signs[self._certain], self._asked, lanes=lanes if with_lanes else None
+        )
+
+
+def _cost(bundle: Bundle) -> float:
+    """Of all terms, where the bundle is and in its scales."""
+    return sum(float(cost) for cost in term_costs(bundle.problem(), bundle.values()).values())
+
+
+def _scales(bundle: Bundle) -> dict[str, float]:
+    names = ("sign_px", "lane_px", "lane_correlation")
+    scales = dict(zip(names, bundle.scale.tolist(), strict=True))
+    return {**scales, "lasting_px": math.sqrt(float(bundle.lasting))}
 
 
 def corner_residuals(bundle: Bundle) -> Float[Tensor, "m 2"]:

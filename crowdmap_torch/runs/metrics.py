@@ -41,7 +41,11 @@ def metrics_of(
         "pruned": plain(pruned_of(dataset, result, config)),
         "times_s": dict(seconds),
         "costs": [
-            {"iteration": i.number, "accepted": i.accepted, "total": i.total, **i.cost}
+            {
+                **{"iteration": i.number, "accepted": i.accepted, "judged": i.judged},
+                **{"before": i.cost_before, "total": i.total, **i.cost},
+                "scale": dict(i.scale),
+            }
             for i in iterations
         ],
         "outcome": result.state.reasons[0],

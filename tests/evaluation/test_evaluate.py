@@ -6,11 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from crowdmap_torch.evaluation.evaluate import control_ids_of, evaluate_map, progress_scalars
+from crowdmap_torch.evaluation.evaluate import (
+    against,
+    control_ids_of,
+    evaluate_map,
+    progress_scalars,
+)
 from crowdmap_torch.evaluation.single_journey import JourneyLandmarks
 from crowdmap_torch.evaluation.text import format_figures
+from crowdmap_torch.io.area import Area
 from crowdmap_torch.io.surveys import read_survey
-from crowdmap_torch.io.truth import SignAssociations, Truth
+from crowdmap_torch.io.truth import JourneyTruth, SignAssociations, Truth
 from crowdmap_torch.tables import Origin
 
 
@@ -118,11 +124,49 @@ def test_another_origin_is_refused(build, simulated):
 
 def test_progress_scalars_leave_out_what_is_unknown(build, simulated):
     true, lines, survey, _ = simulated
-    scalars = progress_scalars(build.moved(true, (0.1, 0, 0)), survey, lanes=build.lanes(lines))
+    moved, asked = build.moved(true, (0.1, 0, 0)), against(survey)
+    scalars = progress_scalars(moved, asked, lanes=build.lanes(lines))
     assert scalars["error/corner_m"] == pytest.approx(0.1)
     assert scalars["error/lane_recall"] == 1
     nothing = true[torch.zeros(0, dtype=torch.int64)]
-    assert "error/corner_m" not in progress_scalars(nothing, survey)
+    assert "error/corner_m" not in progress_scalars(nothing, asked)
+
+
+def test_a_tag_and_a_figure_of_one_name_are_one_number(build, simulated):
+    true, lines, survey, truth = simulated
+    # One sign that nobody saw, and one that pins the map: neither is asked for.
+    unseen = replace(truth, journeys=tuple(_without_sign(t, 2) for t in truth.journeys))
+    generator = torch.Generator().manual_seed(1)
+    noise = 0.1 * torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    hd_map = build.hd_map(build.moved(true[torch.arange(2)], noise), build.lanes([lines[0] + 0.1]))
+    for area in (None, [30.0, -50.0, 70.0, 50.0]):
+        provenance = {} if area is None else {"bbox": area}
+        figures = evaluate_map(
+            replace(hd_map, provenance=provenance), survey, truth=unseen, control_ids=("s1",)
+        )
+        asked = against(
+            survey, truth=unseen, control_ids=("s1",), area=None if area is None else Area(*area)
+        )
+        signs, found = figures.signs, figures.lanes
+        assert found is not None and signs.observable == 1
+        assert progress_scalars(hd_map.signs, asked, lanes=hd_map.lanes) == pytest.approx(
+            {
+                "error/corner_m": signs.absolute.total.mean,
+                "error/corner_horizontal_m": signs.absolute.horizontal.mean,
+                "error/corner_vertical_m": signs.absolute.vertical.mean,
+                "error/center_m": signs.absolute_center.total.mean,
+                "error/normal_deg": signs.normal_deg.mean,
+                "error/sign_recall": signs.recall,
+                "error/sign_precision": signs.precision,
+                "error/lane_lateral_m": found.lateral.mean,
+                "error/lane_lateral_without_shift_m": found.lateral_without_shift.mean,
+                "error/lane_recall": found.recall,
+            }
+        )
+
+
+def _without_sign(truth: JourneyTruth, sign: int) -> JourneyTruth:
+    return replace(truth, sign=torch.where(truth.sign == sign, -1, truth.sign))
 
 
 def test_real_surveyed_centres_are_measured_by_centre(build, real_data):

@@ -5,6 +5,7 @@ import torch
 from worlds.small_world import Builder
 
 from crowdmap_torch.evaluation.evaluate import evaluate_map
+from crowdmap_torch.report.drives import CornerResiduals, Drift
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.plots import Eigengap
 from crowdmap_torch.report.record import RunRecord
@@ -36,13 +37,16 @@ def record(build: Builder) -> RunRecord:
             damping=1e-4,
             gain_ratio=0.9,
             step_norm=1.0 / (n + 1),
+            cost_before=120.0 / (n + 1) if n else float("nan"),
+            scale={"sign_px": 2.0 if n < 2 else 1.0, "lane_correlation": 0.1},
+            judged=int(n > 3),
             errors={"error/corner_m": 0.2 / (n + 1)},
         )
         for n in range(5)
     )
     return RunRecord(
         title="a street <of> tests",
-        subtitle="version & date",
+        facts={"with": "version & date"},
         hd_map=hd_map,
         map_before=before,
         survey=survey,
@@ -74,6 +78,13 @@ def record(build: Builder) -> RunRecord:
         outages=(OutageSummary("a", 120.0, 310.4, 2.75),),
         spectra=(Eigengap("signs, round 2", (0.0, 0.01, 0.02, 0.7, 0.8), 3),),
         residual_px={"triangulated": torch.rand(200, generator=generator) + 0.1},
+        corners=CornerResiduals(
+            journey=torch.arange(200) % 2,
+            residual_px=torch.randn(200, 2, generator=generator, dtype=torch.float64),
+            place=torch.rand(200, 2, generator=generator, dtype=torch.float64) * 0.1,
+            range_m=10 + 40 * torch.rand(200, generator=generator, dtype=torch.float64),
+        ),
+        drifts=(Drift("a", (0.0, 50.0, 100.0), (0.1, 0.0, -0.1), (0.0,) * 3, (-0.2, 0.1, 0.1)),),
         iterations=iterations,
         outcome="converged: the cost no longer falls",
         timings_s={"read": 1.0, "adjust": 4.0},

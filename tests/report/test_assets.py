@@ -21,7 +21,8 @@ def test_every_class_and_variable_of_the_style_is_used(record):
     page = report_html(record)
     used = page.replace(STYLE, "")
     for name in set(re.findall(r"\.([a-z]\w*)[ ,.:{>]", re.sub(r"\{[^}]*\}", "{", STYLE))):
-        # What a sign is to the survey is the class of its tag.
-        assert name in used or name in ("duplicate", "false", "control", "matched"), name
+        # What a sign is to the survey is the class of its tag, and how good the map is that of the verdict.
+        others = ("duplicate", "false", "control", "matched", "good", "fair", "poor")
+        assert name in used or name in others, name
     for name in set(re.findall(r"var\((--\w+)\)", STYLE)):
         assert f"{name}:" in page, name

@@ -12,6 +12,7 @@ from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.crowd_signs.outages import Outage
 from crowdmap_torch.crowd_signs.outlier_journeys import OutlierJourney
 from crowdmap_torch.geometry.trajectory import station
+from crowdmap_torch.io.area import OUTSIDE
 from crowdmap_torch.io.datasets import row_count
 from crowdmap_torch.lanes import reconstruct
 from crowdmap_torch.mapper import MapResult
@@ -122,6 +123,7 @@ def test_an_empty_map_is_told_with_a_count_for_every_reason(
 def test_every_fate_that_is_explained_exists() -> None:
     tracks = {f"in a track: {why}" for why in (*triangulate.REASONS, *reconstruct.REASONS)}
     others = {NO_TRACK, OUTLIER_JOURNEY, OUTAGE, TOO_FEW_JOURNEYS, IMPROBABLE}
+    others.add(f"dropped at the door: {OUTSIDE}")
     assert _WHY.keys() <= tracks | others
 
 

@@ -68,10 +68,25 @@ def test_every_section_is_there_and_linked(text: str):
 def test_what_looked_wrong_stands_first(record: RunRecord):
     found = Finding("axes", "the <camera> looks aside", "poses do not fit", "turn them", ("a", "b"))
     text = report_html(replace(record, warnings=(found,)))
-    assert parse(text).links[0] == "warnings"
-    told = text[text.index('id="warnings"') : text.index('id="headline"')]
-    for words in ("the &lt;camera&gt; looks aside", "a, b", "poses do not fit", "turn them"):
+    assert parse(text).links[1] == "warnings"
+    told = text[text.index('class="verdict') : text.index('id="warnings"')]
+    for words in ("e &lt;camera&gt; looks aside", "a, b", "poses do not fit", "turn them"):
         assert words in told
+
+
+def test_the_verdict_stands_above_all_and_what_is_poor_above_what_is_well(record: RunRecord):
+    text = report_html(record)
+    assert text.index('class="verdict') < text.index('class="card"')
+    missing = Finding("no-signs", "the map has no signs", "rays do not meet", "check the poses")
+    text = report_html(replace(record, warnings=(missing,)))
+    assert 'class="verdict poor"' in text and "The map is poor." in text
+    first = text[text.index("<li") : text.index("</li>")]
+    assert "no signs" in first and "rays do not meet; check the poses" in first
+
+
+def test_the_head_says_what_was_mapped_when_and_with_what(text: str):
+    head = text[text.index("<header>") : text.index("</header>")]
+    assert "<dt>with</dt><dd>version &amp; date</dd>" in head
 
 
 def test_nothing_wrong_needs_no_section(text: str):

@@ -13,10 +13,8 @@ from crowdmap_torch.evaluation.signs import compare_signs
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.report import plots
-from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.plots import Eigengap, sign_errors
 from crowdmap_torch.report.record import RunRecord
-from crowdmap_torch.report.summaries import JourneySummary
 from crowdmap_torch.tables import Dataset, Survey
 
 
@@ -31,14 +29,10 @@ def over_image() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def every_plot(record: RunRecord):
-    assert record.comparison is not None
     return [
         plots.plot_map(record.hd_map, record.survey),
-        plots.plot_sign_errors(record.comparison, record.comparison_before, oracle_m=0.1),
-        plots.plot_bias(record.journeys),
         plots.plot_eigengaps(record.spectra),
         plots.plot_residuals(record.residual_px),
-        plots.plot_convergence(record.iterations),
         plots.plot_residuals_over_image(*over_image(), (1280, 720)),
     ]
 
@@ -89,9 +83,7 @@ def test_nothing_to_draw_is_drawn(build, record, residual):
         plots.plot_map(nothing),
         plots.plot_residuals({"a": residual}),
         plots.plot_residuals_over_image(both, both, (8, 6)),
-        plots.plot_convergence([Iteration(0, {"a": 0.0}, 1.0, 0.0, 0.0)]),
         plots.plot_eigengaps([Eigengap("one", (0.0,), 1), Eigengap("none", (), 0)]),
-        plots.plot_bias([JourneySummary("a", 0, 0, 0, 0, (0.0, 0.0, 0.0))]),
     ]
     for figure in figures:
         assert plots.svg(figure)

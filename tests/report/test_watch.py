@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.evaluation.evaluate import against
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.report.tensorboard import TensorBoardLog
-from crowdmap_torch.report.watch import Watch, corner_residuals
+from crowdmap_torch.report.watch import Residuals, Watch, corner_residuals
 from crowdmap_torch.tables import Dataset, Survey
 
 
@@ -23,7 +25,7 @@ def watched(tiny: Dataset, tiny_result: MapResult, tiny_survey: Survey, tmp_path
     bundle = mapper.build_bundle(tiny.journeys, tiny_result.journey_maps, first, MapperConfig())
     state = adjust.start(bundle)
     with TensorBoardLog(folder) as log:
-        watch = Watch(log, tiny_survey, first.signs, first.lanes, every=2)
+        watch = Watch(log, against(tiny_survey), first.signs, first.lanes, every=2)
         watch.start(bundle, mapper.clusters_map(tiny, first))
         for number, after in adjust.steps(bundle, state):
             watch.step(number, after, bundle)
@@ -41,6 +43,23 @@ def test_every_step_is_kept_and_logged_with_its_cost(watched):
     assert [event.step for event in logged] == [1, 2, 3]
     # Events are of single precision.
     assert [e.value for e in logged] == pytest.approx([i.total for i in watch.iterations], rel=1e-6)
+
+
+def test_a_step_ends_below_where_it_began_in_its_own_scales(watched):
+    watch, _, _ = watched
+    for step in watch.iterations:
+        assert step.cost_before > step.total if step.accepted else step.cost_before == step.total
+        assert set(step.scale) == {"sign_px", "lane_px", "lane_correlation", "lasting_px"}
+    for step, following in pairwise(watch.iterations):
+        assert step.cost_after == following.cost_before
+    # Scales narrow after the first step: the same errors are more of them.
+    first = watch.iterations[0]
+    assert first.cost_after > first.total
+    assert first.scale["sign_px"] > watch.iterations[-1].scale["sign_px"]
+    # Where another watch goes on, the next step begins where this one ended.
+    other = Watch(watch._log, None, watch._signs, watch._lanes)
+    other.go_on(Residuals({}, 1.0), watch.course)
+    assert other._cost == watch.iterations[-1].cost_after
 
 
 def test_errors_and_residuals_are_those_of_the_steps_looked_at(watched):
