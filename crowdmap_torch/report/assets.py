@@ -30,7 +30,7 @@ header dd { margin:0; overflow-wrap:anywhere; }
 .verdict li { margin:3px 0; padding-left:20px; text-indent:-20px; }
 .verdict li b { display:inline-block; width:20px; text-indent:0; }
 .verdict summary { cursor:pointer; color:var(--ink); font-size:14px; margin-top:6px; }
-.verdict em { color:var(--ink); font-style:normal; opacity:.82; }
+.verdict em { color:var(--ink); font-style:normal; font-weight:400; opacity:.85; }
 .verdict.good { background:var(--good-back); color:var(--good-ink); }
 .verdict.fair { background:var(--fair-back); color:var(--fair-ink); }
 .verdict.poor { background:var(--bad-back); color:var(--bad-ink); }

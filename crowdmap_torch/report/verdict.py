@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from crowdmap_torch.evaluation.text import percent_text
 from crowdmap_torch.report.fates import reason_of
@@ -38,7 +38,13 @@ class Judgement:
 def judgements(record: RunRecord) -> tuple[Judgement, ...]:
     """All that can be judged, the worst first, else in the order in which people ask."""
     order = (POOR, FAIR, GOOD)
-    return tuple(sorted(_judged(record), key=lambda j: order.index(j.grade)))
+    found, told = [], {""}
+    for judgement in sorted(_judged(record), key=lambda j: order.index(j.grade)):
+        # What explains two things is said once.
+        is_new = judgement.reason not in told
+        found.append(judgement if is_new else replace(judgement, reason=""))
+        told.add(judgement.reason)
+    return tuple(found)
 
 
 def overall(found: tuple[Judgement, ...]) -> str:
@@ -116,7 +122,8 @@ def _most_lost(record: RunRecord, kind: str) -> str:
         return ""
     most = max(lost, key=lambda p: p.count)
     cause, cure = reason_of(most.reason)
-    return f"{most.count:,} of {sum(p.count for p in lost):,} that are not ended {most.reason!r}: {cause}; {cure}"
+    total = sum(p.count for p in lost)
+    return f"Of {total:,} {kind} detections that are not, {most.count:,} ended {most.reason!r}: {cause}; {cure}"
 
 
 def _at_least(value: float, limits: tuple[float, float]) -> str:

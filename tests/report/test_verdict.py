@@ -51,7 +51,7 @@ def test_missing_detections_come_with_what_most_of_them_failed_at(sound: RunReco
             and first.text == f"{used}.0 % of the sign detections are in the map"
         )
         assert first.reason.startswith(
-            "50 of 70 that are not ended 'in a track: too far away': nothing is seen from near"
+            "Of 70 sign detections that are not, 50 ended 'in a track: too far away': nothing is seen from near"
         )
 
 
@@ -86,3 +86,19 @@ def test_what_cannot_be_judged_is_not(build):
     bare = RunRecord("bare", build.hd_map(build.signs([[0.0, 0, 2]])))
     assert [j.grade for j in judgements(bare)] == [GOOD]
     assert overall(()) == FAIR
+
+
+def test_what_explains_two_things_is_said_once(sound: RunRecord, build):
+    assert sound.survey is not None
+    half = build.hd_map(sound.hd_map.signs[torch.arange(4)])
+    lost = (Pruned("sign detections", "in no track", 70),)
+    found = judgements(
+        replace(
+            sound,
+            hd_map=half,
+            figures=evaluate_map(half, sound.survey),
+            counts={**sound.counts, "sign detections used": 30},
+            pruned=lost,
+        )
+    )
+    assert [bool(j.reason) for j in found if "sign" in j.text][:2] == [True, False]
