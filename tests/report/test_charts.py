@@ -98,7 +98,7 @@ def test_nothing_to_draw_is_drawn(record: RunRecord):
         *charts.step_charts([Iteration(0, {"a": 0.0}, 1.0, 0.0, 0.0)]),
         *charts.step_charts([]),
         *charts.eigengap_charts([Eigengap("one", (0.0,), 1), Eigengap("none", (), 0)]),
-        *charts.bias_charts([JourneySummary("a", 0, 0, 0, 0, (math.nan,) * 3)]),
+        *charts.bias_charts([JourneySummary("a", 0, 0, 0, 0, (math.nan, math.nan, math.nan))]),
         *charts.residual_charts({"a": torch.zeros(5), "b": torch.zeros(0)}, None, []),
         *charts.drift_charts([]),
     ]
