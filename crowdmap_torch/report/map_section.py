@@ -13,7 +13,7 @@ def map_section(record: RunRecord) -> str:
         Scene(
             kind="run",
             title=record.title,
-            subtitle=record.subtitle,
+            subtitle=", ".join(record.facts.values()),
             origin=record.hd_map.origin,
             hd_map=record.hd_map,
             map_before=record.map_before,
