@@ -181,7 +181,8 @@ class Fleet:
     def priors(self) -> dict[str, CostTerm]:
         """Calibrations are about as stated, or as found before, and about as those of the other cars."""
         every = torch.arange(len(self.vehicles), device=self.velocity.device)
-        first, second = torch.combinations(every).unbind(1)
+        count = len(self.vehicles)
+        first, second = torch.triu_indices(count, count, 1, device=every.device)
         terms = {}
         for name in self.variables:
             together = ~self.found_before[name] & alike(name, self.config).to(every.device)

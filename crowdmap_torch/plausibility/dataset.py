@@ -21,7 +21,7 @@ from crowdmap_torch.plausibility.finding import Finding, Repair, gathered
 from crowdmap_torch.plausibility.lens import is_bare, lens_findings
 from crowdmap_torch.plausibility.poses import axes_alike, in_kilometres, pose_findings
 from crowdmap_torch.plausibility.rig import rig_findings
-from crowdmap_torch.tables import Dataset, Journey
+from crowdmap_torch.tables import Dataset, Journey, to_device
 from crowdmap_torch.tracking.sign_features import SignAssociationConfig
 from crowdmap_torch.tracking.signs import associate_signs
 
@@ -43,8 +43,9 @@ def findings_by_journey(
     """What looks wrong, with the journey in which it was seen.
 
     Signs are triangulated only where nothing else is wrong: a mistake that shows by itself spoils them too. Of many sound
-    journeys some are triangulated, and what is found is said of all of them.
+    journeys some are triangulated, and what is found is said of all of them. What is looked at is on the processor.
     """
+    dataset = to_device(dataset, "cpu")
     found = [
         (journey.journey_id, finding)
         for journey in dataset.journeys
