@@ -131,7 +131,7 @@ def _reversed(px: _Points, count: _Counts, task: Task) -> _Points:
     return px[start[row] + count[row] - 1 - place]
 
 
-def _of_fours(count: _Counts) -> Int[np.ndarray, "n 4"]:
+def _of_fours(count: _Counts) -> Int[np.ndarray, "fours 4"]:
     """Places of the points of rows with four."""
     start = (np.cumsum(count) - count)[count == 4]
     return start[:, None] + np.arange(4)

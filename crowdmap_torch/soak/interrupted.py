@@ -53,8 +53,12 @@ _ATTEMPTS = 8
 _FOUND = re.compile(
     rf"resuming: (\d+) of {_JOURNEYS} journeys(, clusters and biases)?(?:, step (\d+))?$", re.M
 )
-_TIMES = {"map.json": ("provenance", "created_at"), "metrics.json": ("times_s",)}
-"""What differs between two runs on the same input, by file."""
+_TIMES = {
+    "map.json": ("provenance", "created_at"),
+    "metrics.json": ("times_s",),
+    "run.json": ("dataset",),
+}
+"""What differs between two runs on the same input, by file: times, and the way from the run to its data set."""
 
 
 @dataclass(frozen=True)

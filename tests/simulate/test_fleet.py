@@ -38,7 +38,8 @@ EXACT_POSES: PositioningConfig = replace(
     **{
         f.name: 0.0
         for f in fields(PositioningConfig)
-        if f.name in ("drift_m", "drift_rot_deg") or f.name.startswith(("bias", "white"))
+        if f.name in ("drift_m", "drift_rot_deg")
+        or (f.name.startswith(("bias", "white")) and "length" not in f.name)
     },
 )
 SIZES: dict[str, Any] = {
