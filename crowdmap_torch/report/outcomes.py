@@ -102,9 +102,12 @@ def _near(
         return near
     misfit, _ = misfit_px(journey.signs, signs, pairs, torch.zeros_like(pairs.px[:, 0]))
     fits = misfit < pairs.size.clamp_min(_LEAST_PX)
-    # The last one written is the best.
     order = torch.nonzero(fits)[:, 0]
-    order = order[misfit[order].argsort(descending=True, stable=True)]
-    for row, sign in zip(pairs.row[order].tolist(), pairs.sign[order].tolist(), strict=True):
-        near[row] = sign
+    order = order[misfit[order].argsort(descending=True, stable=True)].flip(0)
+    order = order[pairs.row[order].argsort(stable=True)]
+    # Of each detection's the first is the best.
+    begins = torch.ones_like(order, dtype=torch.bool)
+    begins[1:] = pairs.row[order[1:]] != pairs.row[order[:-1]]
+    best = order[begins]
+    near[pairs.row[best]] = pairs.sign[best]
     return near

@@ -132,7 +132,7 @@ def covariance_before(fleet: Fleet, variable: str) -> Tensor:
     terms = [term for name, term in fleet.priors().items() if name.startswith(variable)]
 
     def cost(x: Tensor) -> Tensor:
-        return sum(residuals(term, {variable: x}).square().sum() / 2 for term in terms)  # type: ignore[return-value]
+        return torch.stack([residuals(t, {variable: x}).square().sum() / 2 for t in terms]).sum()
 
     x = fleet.expected[variable]
     hessian = torch.autograd.functional.hessian(cost, x)

@@ -244,16 +244,12 @@ class ChainNormalEquations:
         like, of = self.eliminated_gradient, changes.of
         k, m = self.eliminated_gradient.shape[1], of.shape[1]
         first, second = changes.pair.add(self.structure.plan.leaf_count).T
-        variance = like.new_zeros(len(changes.pair), m)
-        for column in range(changes.columns):
-            rows = torch.nonzero(changes.column == column)[:, 0]
-            right_side = like.new_zeros(len(like), k, m)
-            right_side[first[rows]] = -of
-            right_side[second[rows]] = of
-            found = self.solve_eliminated(right_side)
-            change = found[second[rows]] - found[first[rows]]
-            variance[rows] = (of * change).sum(1)
-        return variance
+        right_side = like.new_zeros(len(like), k, changes.columns, m)
+        right_side[first, :, changes.column] = -of
+        right_side[second, :, changes.column] = of
+        found = self.solve_eliminated(right_side.flatten(2)).view(right_side.shape)
+        change = found[second, :, changes.column] - found[first, :, changes.column]
+        return (of * change).sum(1)
 
     def factorise(
         self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"]
