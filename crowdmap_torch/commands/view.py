@@ -2,7 +2,8 @@
 
 The page is one HTML file that needs no network: the map from above and in 3D, signs with their numbers, their drives and
 their detections in the image, the map before and after the adjustment, errors against a survey. A MAP alone shows the map,
-a RUN everything, a DATASET its raw drives, frame by frame.
+a RUN everything, a DATASET its raw drives, frame by frame. `--rerun` writes the same as a recording for the rerun viewer,
+every camera with what it detected along time, instead of the page; with `--out` beside it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from pathlib import Path
 
 from crowdmap_torch.io.errors import InputError, input_read
 from crowdmap_torch.viewer.page import write_page
-from crowdmap_torch.viewer.sources import read_scene
+from crowdmap_torch.viewer.recording import rerun_sdk, write_recording
+from crowdmap_torch.viewer.sources import read_scene, with_journeys
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,25 +24,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="FILE.html", help="default: beside it, named after it"
     )
     parser.add_argument(
+        "--rerun",
+        type=Path,
+        metavar="FILE.rrd",
+        help="a recording for the rerun viewer (needs crowdmap_torch[rerun]); the page only with --out",
+    )
+    parser.add_argument(
         "--dataset", type=Path, help="of a RUN: the data set it was made of, if it was moved"
     )
     parser.add_argument(
         "--survey", type=Path, metavar="MAP", help="default: the survey of the data set"
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace a FILE that exists")
+    parser.add_argument("--overwrite", action="store_true", help="replace a file that exists")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Writes the page, and says where."""
+    """Writes the page, the recording or both, and says where."""
     shown: Path = options.path
-    out = options.out or shown.resolve().with_name(f"{shown.resolve().name}.html")
-    _require_free(out, options.overwrite)
+    page, recording = options.out, options.rerun
+    if page is None and recording is None:
+        page = shown.resolve().with_name(f"{shown.resolve().name}.html")
+    for out in (page, recording):
+        if out is not None:
+            _require_free(out, options.overwrite)
+    if recording is not None:
+        # Reading takes longer than to see that nothing can be written.
+        rerun_sdk()
     with input_read():
         scene = read_scene(shown, dataset=options.dataset, survey=options.survey)
-    write_page(out, scene)
-    for note in scene.notes:
+        recorded = scene
+        if recording is not None:
+            recorded = with_journeys(scene, shown, options.dataset)
+    if page is not None:
+        write_page(page, scene)
+    if recording is not None:
+        write_recording(recording, recorded)
+    for note in recorded.notes:
         print(f"note: {note}")
-    print(f"view: {out}")
+    for kind, out in (("view", page), ("recording", recording)):
+        if out is not None:
+            print(f"{kind}: {out}")
 
 
 def _require_free(out: Path, overwrite: bool) -> None:

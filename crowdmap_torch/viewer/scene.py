@@ -23,7 +23,7 @@ class Drive:
     t_ns: Int[Tensor, " f"]
     path_world: Float[Tensor, "f 3"]
     """After the adjustment; of a data set as given."""
-    given_world: Float[Tensor, "f 3"] | None = None
+    given_world: Float[Tensor, "g 3"] | None = None
     """As the positioning module had it, where that is known and another."""
     vehicle: str = ""
     image: tuple[int, int] | None = None
@@ -52,7 +52,7 @@ class Scene:
     outcomes: NamedOutcomes | None = None
     """What became of every sign detection of a run."""
     journeys: tuple[Journey, ...] = ()
-    """Of a data set: its drives with what they detected, in the order of `drives`."""
+    """What the drives detected, in the order of `drives`: of a data set, of a run where `with_journeys` was asked."""
     type_names: tuple[str, ...] = ()
     """Codes of the detections in `journeys`."""
     notes: tuple[str, ...] = ()

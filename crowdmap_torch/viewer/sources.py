@@ -5,18 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
 from crowdmap_torch.evaluation.evaluate import refuse_other_origin
 from crowdmap_torch.evaluation.evidence import run_of
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.io.found_calibration import folder_name
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.io.poses import LinkPoses, read_poses
-from crowdmap_torch.io.rigs import read_camera
+from crowdmap_torch.io.rigs import read_camera, read_rig
 from crowdmap_torch.io.sign_outcomes import read_sign_outcomes
 from crowdmap_torch.io.surveys import read_survey
-from crowdmap_torch.tables import HdMap, Survey
+from crowdmap_torch.tables import HdMap, Journey, Survey
 from crowdmap_torch.viewer.scene import Drive, Scene, scene_of_dataset
 
 _POSES, _OUTCOMES = "poses.parquet", "sign_detections.parquet"
@@ -30,9 +35,7 @@ def read_scene(path: Path, *, dataset: Path | None = None, survey: Path | None =
     """
     if (path / "dataset.json").exists():
         return _read_dataset(path, survey)
-    if (path / "map" / "map.json").exists() and not (path / "map.json").exists():
-        return _read_run(path, dataset, survey)
-    run = run_of(path) if (path / "map.json").exists() else None
+    run = _run(path)
     if run is not None:
         return _read_run(run, dataset, survey)
     if not path.is_dir() or not (path / "map.json").exists():
@@ -48,6 +51,58 @@ def read_scene(path: Path, *, dataset: Path | None = None, survey: Path | None =
         hd_map=hd_map,
         survey=None if survey is None else _survey(survey, hd_map),
     )
+
+
+def with_journeys(scene: Scene, path: Path, dataset: Path | None = None) -> Scene:
+    """The scene of the folder `path` with what every camera detected, of a run from where the adjustment put it.
+
+    A run's cameras are those that it found, its detections those of `dataset`, or of the one that it remembers. InputError
+    where that cannot be read; where there is none a note says so.
+    """
+    run = _run(path)
+    if run is None or scene.journeys or scene.kind != "run":
+        return scene
+    source = _remembered(run) if dataset is None else dataset
+    if source is None:
+        note = "cameras are left out: give --dataset, the data set of the run"
+        return replace(scene, notes=(*scene.notes, note))
+    given = load_dataset(source, journeys=[drive.journey_id for drive in scene.drives])
+    adjusted = {journey.journey_id: _adjusted(run, journey) for journey in given.journeys}
+    if missing := [d.journey_id for d in scene.drives if d.journey_id not in adjusted]:
+        raise InputError(f"{source}: journey {missing[0]!r} of the run is set aside there")
+    journeys = tuple(adjusted[drive.journey_id] for drive in scene.drives)
+    return replace(scene, journeys=journeys, type_names=given.type_names)
+
+
+def _adjusted(run: Path, journey: Journey) -> Journey:
+    """A journey with the poses that a run found, through the camera that it found, if it asked for calibrations."""
+    path, own = run / "journeys" / journey.journey_id / _POSES, run / "rigs"
+    with reading(inside=run):
+        poses = read_poses(path)
+        folder = own / folder_name(journey.vehicle)
+        rig = read_rig(folder) if folder.exists() else journey.rig
+    kept = torch.isin(journey.frame_number, poses.frame_number).nonzero()[:, 0]
+    if journey.frame_number[kept].tolist() != poses.frame_number.tolist():
+        raise InputError(
+            f"{path}: its frames are not those of journey {journey.journey_id!r}; "
+            "expected the data set that the run was made of"
+        )
+    # A run of a part of the world has lost the frames outside it; rows of detections stay those of the file.
+    _, row = torch.nonzero(kept[:, None] == journey.signs.frame, as_tuple=True)
+    inside = journey.with_frames(kept)
+    return replace(
+        inside,
+        rig=rig,
+        T_world_camera=poses.T_world_link @ rig.T_link_camera,
+        signs=replace(inside.signs, row=journey.signs.row[row]),
+    )
+
+
+def _run(path: Path) -> Path | None:
+    """The run that a folder is, or whose map it is."""
+    if (path / "map.json").exists():
+        return run_of(path)
+    return path if (path / "map" / "map.json").exists() else None
 
 
 def _read_dataset(path: Path, survey: Path | None) -> Scene:
@@ -118,13 +173,18 @@ def _drive(run: Path, entry: Document, given: dict[str, Drive]) -> Drive:
         frame_number=poses.frame_number,
         t_ns=poses.t_ns,
         path_world=_places(poses),
-        given_world=None if before is None else before.path_world,
+        given_world=None if before is None else before.path_world[_inside(before, poses)],
         vehicle="" if before is None else before.vehicle,
         image=None if before is None else before.image,
         bias=bias,
         bias_sigma=sigma,
         remark=_remark(run, journey_id),
     )
+
+
+def _inside(drive: Drive, poses: LinkPoses) -> Bool[Tensor, " f"]:
+    """Which frames of a drive are in the part of the world that the run is of."""
+    return torch.isin(drive.frame_number, poses.frame_number)
 
 
 def _three(values: object) -> list[float] | None:
