@@ -348,10 +348,11 @@ class Origin:
 
 @dataclass(frozen=True)
 class RejectedJourney:
-    """A journey that was set aside, and why."""
+    """A journey that was set aside, and why: for people, and the rule that was broken (`io.errors.Code`), if it is one."""
 
     journey_id: str
     reason: str
+    code: str = ""
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from crowdmap_torch.checking.causes import explanation
+from crowdmap_torch.checking.causes import EXPLANATIONS, repair_of
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.datasets import load_dataset
-from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.errors import Code, InputError
 from crowdmap_torch.io.faults import Fault
 from crowdmap_torch.io.inspection import inspect_dataset
 from crowdmap_torch.plausibility.dataset import findings_by_journey
@@ -44,6 +44,8 @@ class Item:
     """All rows of that file in which it is so; none: it is about the whole."""
     repairs: tuple[tuple[str, Repair], ...] = ()
     """What puts it right, with the journey to be changed; none: a person has to."""
+    codes: tuple[str, ...] = ()
+    """The rules of FORMAT.md that are broken (`io.errors.Code`); none: it is allowed."""
 
     @property
     def place(self) -> str:
@@ -119,30 +121,31 @@ def _format_items(folder: Path, faults: Sequence[Fault]) -> list[Item]:
         for fault in own:
             if fault in explained:
                 continue
-            cause, cure, kind, repair = explanation(fault)
+            known, repair = EXPLANATIONS[fault.code], repair_of(fault)
             items.append(
                 Item(
                     NOTE if fault.drops else STOPS,
-                    kind,
+                    known.kind,
                     fault.rule,
-                    cause,
-                    cure,
+                    known.cause,
+                    known.cure,
                     journeys,
                     file,
                     fault.rows,
                     ((journey, repair),) if repair is not None and journey else (),
+                    (fault.code,),
                 )
             )
     return items
 
 
-_EXPLAINS = {
-    "unsorted-frames": ("strictly increasing",),
-    "frame-times": ("the car moves", "column 't_ns' has type"),
-    "speed": ("the car moves", "from the origin"),
-    "quaternion-length": ("quaternion qx qy qz qw has length",),
+_EXPLAINS: dict[str, tuple[tuple[Code, str], ...]] = {
+    "unsorted-frames": (("order", "frame"), ("order", "t_ns")),
+    "frame-times": (("leap", ""), ("column-type", "t_ns")),
+    "speed": (("leap", ""), ("far-away", "")),
+    "quaternion-length": (("quaternion-length", ""),),
 }
-"""What is said of a file that is refused for what a finding about its columns names."""
+"""What is said of a file that is refused for what a finding about its columns names: codes, with the column if it is one."""
 
 
 def _of_columns(path: Path, refused: Sequence[Fault]) -> Iterator[tuple[Item, set[Fault]]]:
@@ -150,11 +153,12 @@ def _of_columns(path: Path, refused: Sequence[Fault]) -> Iterator[tuple[Item, se
     if raw is None:
         return
     for finding in raw_findings(raw):
-        own = {f for f in refused if any(text in f.rule for text in _EXPLAINS[finding.kind])}
+        own = {fault for fault in refused if (fault.code, fault.column) in _EXPLAINS[finding.kind]}
         # Rows are in another order once they are sorted.
         rows = sorted({row for fault in own for row in fault.rows})
         told = replace(finding, journeys=())
-        yield replace(_item(told, STOPS), rows=tuple(rows)), own
+        codes = tuple(dict.fromkeys(f.code for f in refused if f in own))
+        yield replace(_item(told, STOPS), rows=tuple(rows), codes=codes), own
 
 
 def _items_of(found: Sequence[tuple[str, Finding]]) -> list[Item]:
@@ -182,18 +186,20 @@ def _item(finding: Finding, severity: str) -> Item:
 def _copies(dataset: Dataset, faulty: set[Path]) -> list[Item]:
     """Journeys that are set aside though their files are right: copies of others."""
     named = {path.name for path in faulty} | {path.parent.name for path in faulty}
+    known = EXPLANATIONS["copy"]
     return [
         Item(
             STOPS,
-            "copy",
+            known.kind,
             one.reason,
-            "one drive was uploaded more than once",
-            "leave the copy out",
+            known.cause,
+            known.cure,
             (one.journey_id,),
             repairs=((one.journey_id, Repair("leave-out-journey")),),
+            codes=(one.code,),
         )
         for one in dataset.rejected
-        if one.reason.startswith("copy of journey ") and one.journey_id not in named
+        if one.code == "copy" and one.journey_id not in named
     ]
 
 

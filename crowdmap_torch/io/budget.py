@@ -83,7 +83,9 @@ def refuse_way_out(path: Path) -> None:
     real = os.path.realpath(path)
     for named, root in _READING.get().roots:
         if real != root and not real.startswith(root.rstrip(os.sep) + os.sep):
-            raise InputError(f"{path}: a link leads out of {named}; copy what it points at")
+            raise InputError(
+                f"{path}: a link leads out of {named}; copy what it points at", "missing-file"
+            )
 
 
 def file_size(path: Path, most: int) -> int:
@@ -92,16 +94,16 @@ def file_size(path: Path, most: int) -> int:
         found = os.stat(path)
     except FileNotFoundError as error:
         missing = "a link to nothing is there" if os.path.islink(path) else "the file is missing"
-        raise InputError(f"{path}: {missing}") from error
+        raise InputError(f"{path}: {missing}", "missing-file") from error
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise InputError(f"{path}: cannot be read ({reason})") from error
+        raise InputError(f"{path}: cannot be read ({reason})", "unreadable") from error
     if not stat.S_ISREG(found.st_mode):
         kind = next((name for test, name in _KINDS if test(found.st_mode)), "something else")
-        raise InputError(f"{path}: {kind} is there instead of a file")
+        raise InputError(f"{path}: {kind} is there instead of a file", "missing-file")
     refuse_way_out(path)
     if found.st_size > most:
-        raise InputError(f"{path}: has {found.st_size} bytes; expected {most} at most")
+        raise InputError(f"{path}: has {found.st_size} bytes; expected {most} at most", "too-large")
     return found.st_size
 
 
@@ -113,9 +115,11 @@ def read_bytes(path: Path) -> bytes:
         with path.open("rb") as file:
             content = file.read(most + 1)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror})", "unreadable") from error
     if len(content) > most:
-        raise InputError(f"{path}: has more than {most} bytes; expected {most} at most")
+        raise InputError(
+            f"{path}: has more than {most} bytes; expected {most} at most", "too-large"
+        )
     return content
 
 
@@ -125,7 +129,7 @@ def read_text(path: Path) -> str:
         return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: is no UTF-8 text (byte {error.start}); expected a text file"
+            f"{path}: is no UTF-8 text (byte {error.start}); expected a text file", "unreadable"
         ) from error
 
 

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float, Int
 
 from crowdmap_torch.io.budget import FREE_BYTES, budget_now, file_size
-from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.io.errors import Code, InputError, one_line
 from crowdmap_torch.io.faults import Fault, FaultsGathered, gathered
 
 MAX_PLACE_M = 1e6
@@ -50,7 +50,7 @@ class Sheet:
         self._table, missing = _read(path, required, optional)
         self._wrong: dict[str, Bool[np.ndarray, " n"]] = {}
         for name, rule in missing.items():
-            self._keep(rule, np.zeros(0, dtype=np.int64))
+            self._keep(rule, "missing-column", np.zeros(0, dtype=np.int64), name)
             self._wrong[name] = np.ones(len(self), dtype=bool)
 
     def __len__(self) -> int:
@@ -59,12 +59,16 @@ class Sheet:
     def __contains__(self, name: str) -> bool:
         return name in self._table.column_names
 
-    def fault(self, rule: str, row: int | None = None) -> InputError:
+    def fault(self, rule: str, row: int | None = None, code: Code = "other") -> InputError:
         """The error that says in which row of which file a rule is broken."""
-        return InputError(f"{self.path}: {'' if row is None else f'row {row}: '}{rule}")
+        return InputError(f"{self.path}: {'' if row is None else f'row {row}: '}{rule}", code)
 
     def refuse(
-        self, is_bad: Bool[np.ndarray, " n"], rule: Callable[[int], str], *columns: str
+        self,
+        is_bad: Bool[np.ndarray, " n"],
+        rule: Callable[[int], str],
+        *columns: str,
+        code: Code = "other",
     ) -> None:
         """Raises for the first bad row; `rule` words what is wrong with a row.
 
@@ -77,27 +81,28 @@ class Sheet:
         if not is_bad.any():
             return
         rows = np.flatnonzero(is_bad)
-        self._keep(rule(int(rows[0])), rows)
+        self._keep(rule(int(rows[0])), code, rows, *(columns if len(columns) == 1 else ()))
         for name in columns:
             self._wrong[name] = self._wrong.get(name, False) | is_bad
 
-    def leave_out(self, reason: str, rows: Int[np.ndarray, " k"]) -> None:
+    def leave_out(self, reason: str, code: Code, rows: Int[np.ndarray, " k"]) -> None:
         """Notes rows, where faults are gathered, that have a fault of their own and are not used."""
         faults = gathered()
         if faults is not None and len(rows):
-            faults.append(Fault(self.path, reason, tuple(np.unique(rows).tolist()), drops=True))
+            named = tuple(np.unique(rows).tolist())
+            faults.append(Fault(self.path, reason, code, named, drops=True))
 
     def require_sound(self) -> None:
         """Where faults are gathered, ends the reading of a file that has some: what follows rests on its values."""
         if any(f.path == self.path and not f.drops for f in gathered() or ()):
             raise FaultsGathered(f"{self.path}: has faults")
 
-    def _keep(self, rule: str, rows: Int[np.ndarray, " k"]) -> None:
+    def _keep(self, rule: str, code: Code, rows: Int[np.ndarray, " k"], column: str = "") -> None:
         """Raises a fault, or gathers it."""
         faults = gathered()
         if faults is None:
-            raise self.fault(rule, int(rows[0]) if len(rows) else None)
-        faults.append(Fault(self.path, rule, tuple(rows.tolist())))
+            raise self.fault(rule, int(rows[0]) if len(rows) else None, code)
+        faults.append(Fault(self.path, rule, code, tuple(rows.tolist()), column=column))
 
     def integers(self, name: str, *, null: int | None = None) -> Int[np.ndarray, " n"]:
         """Whole numbers; where `null` is given, a null or missing column holds it instead."""
@@ -126,6 +131,7 @@ class Sheet:
             known & ~np.isfinite(numbers),
             lambda row: f"column {name!r}: expected a finite number, found {numbers[row]}",
             name,
+            code="not-finite",
         )
         return numbers
 
@@ -146,7 +152,8 @@ class Sheet:
             texts = column.cast(pa.string())
             texts.validate(full=True)
         except pa.ArrowInvalid as error:
-            raise self.fault(f"column {name!r}: expected UTF-8 ({one_line(error)})") from error
+            rule = f"column {name!r}: expected UTF-8 ({one_line(error)})"
+            raise self.fault(rule, code="unreadable") from error
         return texts
 
     def codes(
@@ -166,6 +173,7 @@ class Sheet:
                 + ", ".join(names)
             ),
             name,
+            code="unknown-name",
         )
         return codes
 
@@ -173,7 +181,7 @@ class Sheet:
         """Texts none of which is empty or stands in two rows."""
         names = self.strings(name).to_pylist()
         if "" in names:
-            raise self.fault(f"column {name!r}: expected a name, found ''", names.index(""))
+            raise self.fault(f"column {name!r}: expected a name, found ''", names.index(""), "null")
         if len(set(names)) < len(names):
             first: dict[str, int] = {}
             row = next(k for k, text in enumerate(names) if first.setdefault(text, k) != k)
@@ -181,6 +189,7 @@ class Sheet:
                 f"column {name!r}: {names[row]!r} stands in row {first[names[row]]} too; "
                 "expected each name once",
                 row,
+                "name-twice",
             )
         return tuple(names)
 
@@ -197,6 +206,7 @@ class Sheet:
                 column.is_valid().to_numpy(zero_copy_only=False) & (size != count),
                 lambda row: f"column {name!r}: expected {count} numbers, found {size[row]}",
                 name,
+                code="point-count",
             )
         return lists
 
@@ -217,15 +227,15 @@ class Sheet:
         inner = column.flatten()
         if inner.null_count:
             bad = int(inner.is_null().to_numpy(zero_copy_only=False).argmax())
-            raise self.fault(f"column {name!r}: a point is null; expected 3 numbers", int(row[bad]))
+            rule = f"column {name!r}: a point is null; expected 3 numbers"
+            raise self.fault(rule, int(row[bad]), "null")
         if pa.types.is_null(inner.type):
             return Lists(np.zeros((0, 3)), count)
         size = _lengths(inner)
         if (size != 3).any():
             bad = int((size != 3).argmax())
-            raise self.fault(
-                f"column {name!r}: a point has {size[bad]} numbers; expected 3", int(row[bad])
-            )
+            rule = f"column {name!r}: a point has {size[bad]} numbers; expected 3"
+            raise self.fault(rule, int(row[bad]), "point-count")
         values = self._values(name, inner.flatten(), np.repeat(row, 3))
         points = Lists(values.reshape(-1, 3), count)
         self._refuse_far(name, points)
@@ -241,6 +251,7 @@ class Sheet:
                 f"column {name!r}: ({place}) is over {MAX_PLACE_M / 1000:,.0f} km from the origin; "
                 "expected metres east, north and up of it",
                 int(points.row[at]),
+                "far-away",
             )
 
     def _refuse_long(self, name: str, column: pa.Array) -> None:
@@ -251,7 +262,8 @@ class Sheet:
         length = pc.call_function("binary_length", [column.dictionary]).fill_null(0).to_numpy()
         most = min(budget_now().decoded_bytes, 2**31 - 1)
         if (found := int(count.astype(np.int64) @ length.astype(np.int64))) > most:
-            raise self.fault(f"column {name!r}: {found} bytes of text; expected {most} at most")
+            rule = f"column {name!r}: {found} bytes of text; expected {most} at most"
+            raise self.fault(rule, code="too-large")
 
     def _values(
         self, name: str, flat: pa.Array, row: Int[np.ndarray, " p"]
@@ -263,9 +275,8 @@ class Sheet:
             found = values[first] if flat[first].is_valid else "null"
             is_bad = np.zeros(len(self), dtype=bool)
             is_bad[row[bad]] = True
-            self.refuse(
-                is_bad, lambda _: f"column {name!r}: expected finite numbers, found {found}", name
-            )
+            rule = f"column {name!r}: expected finite numbers, found {found}"
+            self.refuse(is_bad, lambda _: rule, name, code="not-finite")
         return values
 
     def _column(
@@ -282,13 +293,13 @@ class Sheet:
             is_coded = pa.types.is_dictionary(column.type)
             found = column.type.value_type if is_coded else column.type
             rule = f"column {name!r} has type {found}; expected {expected}"
-            self._keep(rule, np.zeros(0, dtype=np.int64))
+            self._keep(rule, "column-type", np.zeros(0, dtype=np.int64), name)
             self._wrong[name] = np.ones(len(self), dtype=bool)
             return self._stand_in(expected)
         if not nullable and column.null_count:
             is_null = column.is_null().to_numpy(zero_copy_only=False)
             rule = f"column {name!r} is null; expected a value in every row"
-            self.refuse(is_null, lambda _: rule, name)
+            self.refuse(is_null, lambda _: rule, name, code="null")
             values = column.to_pylist()
             filled = [_STAND_INS[expected] if value is None else value for value in values]
             return pa.array(filled, column.type)
@@ -329,7 +340,8 @@ def _read(
     try:
         size = file_size(path, budget_now().table_bytes)
     except InputError as error:
-        raise InputError(f"{error}; expected a Parquet file (with no rows if need be)") from error
+        rule = f"{error}; expected a Parquet file (with no rows if need be)"
+        raise InputError(rule, error.code) from error
     try:
         with pq.ParquetFile(path) as file:
             names = file.schema_arrow.names
@@ -343,7 +355,8 @@ def _read(
     except (pa.ArrowException, OSError, *_ARROW_TRIPS) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: cannot be read as Parquet ({one_line(error)})") from error
+        rule = f"{path}: cannot be read as Parquet ({one_line(error)})"
+        raise InputError(rule, "unreadable") from error
 
 
 _ARROW_TRIPS = (ValueError, TypeError, KeyError, OverflowError, MemoryError)
@@ -362,14 +375,15 @@ def _weigh(path: Path, size: int, footer: pq.FileMetaData, wanted: Sequence[str]
     stored = [chunk.total_compressed_size for chunk in chunks]
     least = (*rows, *stored, *(c.num_values for c in chunks), 0)
     if sum(rows) != footer.num_rows or min(least) < 0 or sum(stored) > size:
-        raise InputError(f"{path}: cannot be read as Parquet (its footer contradicts itself)")
+        rule = f"{path}: cannot be read as Parquet (its footer contradicts itself)"
+        raise InputError(rule, "unreadable")
     if footer.num_rows > budget.rows:
-        raise InputError(f"{path}: claims {footer.num_rows} rows; expected {budget.rows} at most")
+        rule = f"{path}: claims {footer.num_rows} rows; expected {budget.rows} at most"
+        raise InputError(rule, "too-large")
     most = min(budget.decoded_bytes, FREE_BYTES + budget.expansion * size)
     if decoded > most:
-        raise InputError(
-            f"{path}: {size} bytes claim to hold {decoded} bytes of numbers; expected {most} at most"
-        )
+        rule = f"{path}: {size} bytes claim to hold {decoded} bytes of numbers; expected {most} at most"
+        raise InputError(rule, "too-large")
 
 
 def _missing(
@@ -383,10 +397,11 @@ def _missing(
         if name not in names
     }
     if missing and gathered() is None:
-        raise InputError(f"{path}: {next(iter(missing.values()))}")
+        raise InputError(f"{path}: {next(iter(missing.values()))}", "missing-column")
     for name in wanted:
         if names.count(name) > 1:
-            raise InputError(f"{path}: column {name!r} is there twice; expected it once")
+            rule = f"{path}: column {name!r} is there twice; expected it once"
+            raise InputError(rule, "name-twice")
     return missing
 
 

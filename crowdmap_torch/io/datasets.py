@@ -71,8 +71,8 @@ def _load_dataset(folder: Path, strict: bool, wanted: Sequence[str] | None) -> D
         except InputError as error:
             name = printable(journey_folder.name)
             if strict:
-                raise InputError(f"journey {name!r}: {one_line(error)}") from error
-            rejected.append(RejectedJourney(name, one_line(error)))
+                raise InputError(f"journey {name!r}: {one_line(error)}", error.code) from error
+            rejected.append(RejectedJourney(name, one_line(error), error.code))
             continue
         journeys.append(journey)
         names.append(type_names)
@@ -85,8 +85,8 @@ def _load_dataset(folder: Path, strict: bool, wanted: Sequence[str] | None) -> D
     doubles = _copies(journeys)
     if strict and doubles:
         first = min(doubles)
-        raise InputError(f"journey {first!r}: {doubles[first]}")
-    rejected += [RejectedJourney(journey_id, reason) for journey_id, reason in doubles.items()]
+        raise InputError(f"journey {first!r}: {doubles[first]}", "copy")
+    rejected += [RejectedJourney(name, reason, "copy") for name, reason in doubles.items()]
     rejected.sort(key=lambda aside: aside.journey_id)
     once = [k for k, journey in enumerate(journeys) if journey.journey_id not in doubles]
     journeys, names = [journeys[k] for k in once], [names[k] for k in once]
@@ -143,13 +143,15 @@ def journey_folders(folder: Path) -> list[Path]:
     """The folders of a dataset's journeys, by name; InputError if there are none."""
     journeys = folder / "journeys"
     if not journeys.is_dir():
-        raise InputError(f"{journeys}: the folder is missing; expected one folder for each journey")
+        rule = f"{journeys}: the folder is missing; expected one folder for each journey"
+        raise InputError(rule, "missing-file")
     refuse_way_out(journeys)
     entries = (p for p in journeys.iterdir() if not p.name.startswith("."))
     # A link may be a journey that went astray: it is not passed over as other files are.
     found = [p for p in entries if p.is_dir() or p.is_symlink()]
     if not found:
-        raise InputError(f"{journeys}: has no journeys; expected one folder for each journey")
+        rule = f"{journeys}: has no journeys; expected one folder for each journey"
+        raise InputError(rule, "missing-file")
     return sorted(found)
 
 
@@ -171,13 +173,19 @@ def _named(folders: Sequence[Path], wanted: Sequence[str]) -> list[Path]:
     return [p for p in folders if p in chosen]
 
 
+def refuse_no_journey(folder: Path) -> None:
+    """InputError for a journey's folder that is a link to somewhere else, or to nothing."""
+    refuse_way_out(folder)
+    if not folder.is_dir():
+        rule = f"{folder}: a link that leads to no folder; expected a journey's folder"
+        raise InputError(rule, "missing-file")
+
+
 def _load_journey(
     folder: Path, rigs_folder: Path, rigs: dict[str, Rig | InputError]
 ) -> tuple[Journey, tuple[str, ...]]:
     """A journey with the codes of its own signs; `rigs` keeps rigs, or what is wrong with them."""
-    refuse_way_out(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: a link that leads to no folder; expected a journey's folder")
+    refuse_no_journey(folder)
     head = read_json(folder / "journey.json")
     head.require_format(JOURNEY_FORMAT)
     journey_id = read_journey_id(head)
@@ -190,7 +198,7 @@ def _load_journey(
             rigs[rig_id] = error
     rig = rigs[rig_id]
     if isinstance(rig, InputError):
-        raise InputError(str(rig))
+        raise InputError(str(rig), rig.code)
     poses = read_poses(folder / "poses.parquet")
     frame_number = poses.frame_number.numpy()
     signs = read_sign_detections(folder / "signs.parquet", rig.camera, frame_number)
@@ -217,7 +225,7 @@ def read_journey_id(head: Document) -> str:
     journey_id, folder = head.name("journey_id"), head.path.parent.name
     if journey_id != folder:
         rule = f"{journey_id!r} in the folder {folder!r}; expected the same name"
-        raise head.fault(rule, "journey_id")
+        head.refuse(rule, "journey_id")
     return journey_id
 
 

@@ -20,12 +20,24 @@ from torch import Tensor
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.geometry.camera import MAX_OFF_AXIS, Camera, inside_image, unproject
 from crowdmap_torch.io.columns import Lists, Sheet
+from crowdmap_torch.io.errors import Code
 from crowdmap_torch.io.row_order import points_by_place, rank_of_lists, rows_by_content
 from crowdmap_torch.io.writing import list_column, name_column, write_parquet
 from crowdmap_torch.tables import LANE_TYPES, LaneDetections, LanePoints, SignDetections
 
 DROPPED_SIGN, DROPPED_LANE, DROPPED_LANE_POINT = "sign: ", "lane: ", "lane point: "
 """How the reasons of `Journey.dropped` begin; rows of a file were dropped for the first two."""
+_DROPPED: dict[Code, str] = {
+    "outside-image": "outside the image",
+    "no-area": "no area",
+    "crosses-itself": "crosses itself",
+    "not-clockwise": "not clockwise",
+    "off-axis": "85 degrees or more off the axis",
+    "no-ray": "undistortion does not close",
+    "few-points": "fewer than two usable points",
+    "no-length": "no length",
+}
+"""How they end."""
 
 _MIN_AREA = 1e-6
 """Least area over squared perimeter that is not none; rounding to float32 stays below."""
@@ -70,6 +82,7 @@ def read_sign_detections(
             f"{polygon.SHAPES[shape[row]]} with {u.count[row]} corners; expected {expected[row]}"
         ),
         *("shape", "u", "v"),
+        code="point-count",
     )
     score = _score(sheet)
     track = np.maximum(sheet.integers("track", null=-1), -1)
@@ -118,6 +131,7 @@ def read_lane_detections(
         u.count < 2,
         lambda row: f"lane marker with {u.count[row]} points; expected 2 or more",
         *("u", "v"),
+        code="point-count",
     )
     lane_type = sheet.codes("type", LANE_TYPES, optional=True)
     score = _score(sheet)
@@ -135,10 +149,7 @@ def read_lane_detections(
     good, dropped_rows = _count(
         sheet,
         DROPPED_LANE,
-        {
-            "fewer than two usable points": torch.from_numpy(short),
-            "no length": torch.from_numpy(flat),
-        },
+        {"few-points": torch.from_numpy(short), "no-length": torch.from_numpy(flat)},
         np.arange(len(sheet)),
     )
     content = rank_of_lists(px.numpy()[kept], row, len(sheet))
@@ -221,6 +232,7 @@ def _frame_index(sheet: Sheet, frame_number: Int[np.ndarray, " f"]) -> Int[np.nd
             f"{frame_number[0]} to {frame_number[-1]}; expected a frame that exists"
         ),
         "frame",
+        code="unknown-frame",
     )
     return index
 
@@ -231,6 +243,7 @@ def _pixels(sheet: Sheet) -> tuple[Lists, Lists]:
         u.count != v.count,
         lambda row: f"{u.count[row]} values in u and {v.count[row]} in v; expected as many in both",
         *("u", "v"),
+        code="point-count",
     )
     return u, v
 
@@ -241,13 +254,14 @@ def _score(sheet: Sheet) -> Float[np.ndarray, " n"]:
         (score < 0) | (score > 1),
         lambda row: f"column 'score': expected 0 to 1, found {score[row]:g}",
         "score",
+        code="score",
     )
     return score
 
 
 def _corner_faults(
     camera: Camera, corners_px: Float[Tensor, "n 8 2"], shape: Int[Tensor, " n"]
-) -> tuple[Float[Tensor, "n 8 2"], dict[str, Bool[Tensor, " n"]]]:
+) -> tuple[Float[Tensor, "n 8 2"], dict[Code, Bool[Tensor, " n"]]]:
     """Undistorted corners, and which detections have which fault, the gravest first."""
     mask = polygon.corner_mask(shape)
     area = polygon.signed_area(corners_px, mask)
@@ -255,37 +269,38 @@ def _corner_faults(
     perimeter = (corners_px - corners_px.roll(1, dims=1)).square().sum(-1).sqrt().sum(-1)
     ideal, faults = _point_faults(camera, corners_px)
     return ideal, {
-        "outside the image": faults.pop("outside the image").any(-1),
-        "no area": ~(area.abs() > _MIN_AREA * perimeter.square()),
-        "crosses itself": ~polygon.is_simple(corners_px, mask),
-        "not clockwise": area < 0,
-        **{reason: bad.any(-1) for reason, bad in faults.items()},
+        "outside-image": faults.pop("outside-image").any(-1),
+        "no-area": ~(area.abs() > _MIN_AREA * perimeter.square()),
+        "crosses-itself": ~polygon.is_simple(corners_px, mask),
+        "not-clockwise": area < 0,
+        **{code: bad.any(-1) for code, bad in faults.items()},
     }
 
 
 def _point_faults(
     camera: Camera, px: Float[Tensor, "*batch 2"]
-) -> tuple[Float[Tensor, "*batch 2"], dict[str, Bool[Tensor, "*batch"]]]:
+) -> tuple[Float[Tensor, "*batch 2"], dict[Code, Bool[Tensor, "*batch"]]]:
     ideal, closes = unproject(camera, px)
     # The undistortion stops where rays are not used any more.
     is_wide = ideal.square().sum(-1).sqrt() > (1 - 1e-6) * math.tan(MAX_OFF_AXIS)
     return ideal, {
-        "outside the image": ~inside_image(camera, px),
-        "85 degrees or more off the axis": ~closes & is_wide,
-        "undistortion does not close": ~closes,
+        "outside-image": ~inside_image(camera, px),
+        "off-axis": ~closes & is_wide,
+        "no-ray": ~closes,
     }
 
 
 def _count(
-    sheet: Sheet, prefix: str, faults: dict[str, Bool[Tensor, " n"]], row: Int[np.ndarray, " n"]
+    sheet: Sheet, prefix: str, faults: dict[Code, Bool[Tensor, " n"]], row: Int[np.ndarray, " n"]
 ) -> tuple[Bool[Tensor, " n"], dict[str, int]]:
     """Which of n, of these rows of a file, have no fault, and how many have which one first."""
     usable = torch.ones_like(next(iter(faults.values())))
     dropped = {}
-    for reason, is_faulty in faults.items():
+    for code, is_faulty in faults.items():
         if count := int((usable & is_faulty).sum()):
-            dropped[prefix + reason] = count
-            sheet.leave_out(prefix + reason, row[(usable & is_faulty).numpy()])
+            reason = prefix + _DROPPED[code]
+            dropped[reason] = count
+            sheet.leave_out(reason, code, row[(usable & is_faulty).numpy()])
         usable = usable & ~is_faulty
     return usable, dropped
 

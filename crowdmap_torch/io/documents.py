@@ -17,45 +17,82 @@ from torch import Tensor
 
 from crowdmap_torch.io.atomic import atomic_file
 from crowdmap_torch.io.budget import budget_now, read_text
-from crowdmap_torch.io.errors import InputError, one_line
+from crowdmap_torch.io.errors import Code, InputError, one_line
+from crowdmap_torch.io.faults import Fault, FaultsGathered, gathered
 from crowdmap_torch.ranges import shown
 
 
 class Document:
-    """A mapping of a file, or a section of it, whose values are checked as they are taken."""
+    """A mapping of a file, or a section of it, whose values are checked as they are taken.
+
+    Where faults are gathered, each key that is wrong is told once and another value stands for it: what rests on values
+    asks for `require_sound` first.
+    """
 
     def __init__(self, path: Path, content: object, section: str = "") -> None:
         self.path = path
         self.section = section
+        self._wrong: set[str] = set()
+        self._is_stand_in = False
         if not isinstance(content, dict):
             raise self.fault(f"expected a mapping of keys to values, found {_kind(content)}")
         self.content: dict = content
 
-    def fault(self, rule: str, key: str | None = None) -> InputError:
+    def fault(self, rule: str, key: str | None = None, code: Code = "value") -> InputError:
         """The error that says where in which file a rule is broken."""
         place = ".".join(part for part in (self.section, key) if part)
-        return InputError(f"{self.path}: {place + ': ' if place else ''}{rule}")
+        return InputError(f"{self.path}: {place + ': ' if place else ''}{rule}", code)
+
+    def refuse(
+        self, rule: str, key: str, code: Code = "value", *, of_mapping: bool = False
+    ) -> None:
+        """Raises that error, or gathers it; `of_mapping`: it is said of the whole mapping, not of the key."""
+        faults = gathered()
+        error = self.fault(rule, None if of_mapping else key, code)
+        if faults is None:
+            raise error
+        name = str(key).split("[")[0]
+        if not self._is_stand_in and name not in self._wrong:
+            faults.append(Fault(self.path, str(error).removeprefix(f"{self.path}: "), code))
+        self._wrong.add(name)
+
+    def is_known(self, key: str) -> bool:
+        """Whether nothing has been told of a key; False only where faults are gathered."""
+        return not self._is_stand_in and key not in self._wrong
+
+    def require_sound(self) -> None:
+        """Where faults are gathered, ends the reading of a mapping that has some."""
+        if self._wrong or self._is_stand_in:
+            raise FaultsGathered(f"{self.path}: has faults")
 
     def allow(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
         """Refuses keys that are missing and keys that nobody knows."""
         expected = ", ".join((*required, *(f"{key} (optional)" for key in optional)))
         for key in required:
             if key not in self.content:
-                raise self.fault(f"key {key!r} is missing; expected {expected}")
+                rule = f"key {key!r} is missing; expected {expected}"
+                self.refuse(rule, key, "missing-key", of_mapping=True)
         for key in self.content:
             if key not in required and key not in optional:
-                raise self.fault(f"key {key!r} is unknown; expected {expected}")
+                rule = f"key {key!r} is unknown; expected {expected}"
+                self.refuse(rule, key, "unknown-key", of_mapping=True)
 
     def take(self, key: str) -> object:
         """A value as it stands in the file."""
         if key not in self.content:
-            raise self.fault("is missing", key)
+            self.refuse("is missing", key, "missing-key")
+            return _NO_VALUE
         return self.content[key]
 
     def part(self, key: str) -> Document:
         """A mapping inside this one."""
+        value = self.take(key)
+        if not isinstance(value, dict):
+            self.refuse(f"expected a mapping of keys to values, found {_kind(value)}", key)
         name = f"{self.section}.{key}" if self.section else key
-        return Document(self.path, self.take(key), name)
+        part = Document(self.path, value if isinstance(value, dict) else {}, name)
+        part._is_stand_in = not isinstance(value, dict)
+        return part
 
     def parts(self, key: str) -> list[Document]:
         """A list of mappings inside this one."""
@@ -69,21 +106,22 @@ class Document:
         """A string that is not empty."""
         value = self.take(key)
         if not isinstance(value, str) or not value:
-            raise self.fault(f"expected a text that is not empty, found {_kind(value)}", key)
+            self.refuse(f"expected a text that is not empty, found {_kind(value)}", key)
+            return ""
         return value
 
     def name(self, key: str) -> str:
         """A string that can be the name of one file or folder and nothing else."""
         value = self.text(key)
         if value in (".", "..") or any(c in value for c in "/\\") or not value.isprintable():
-            raise self.fault(f"expected the plain name of a folder, found {shown(value)}", key)
+            self.refuse(f"expected the plain name of a folder, found {shown(value)}", key)
         return self._short(value, key)
 
     def place(self, key: str) -> str:
         """A string that can be the path of a file."""
         value = self.text(key)
         if not value.isprintable():
-            raise self.fault(f"expected the path of a file, found {shown(value)}", key)
+            self.refuse(f"expected the path of a file, found {shown(value)}", key)
         return self._short(value, key)
 
     def integer(self, key: str, *, low: int, high: int) -> int:
@@ -91,7 +129,8 @@ class Document:
         value = self.take(key)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             rule = f"expected a whole number in {low} to {high}, found {_kind(value)}"
-            raise self.fault(rule, key)
+            self.refuse(rule, key)
+            return low
         return value
 
     def number(self, key: str, *, low: float = -math.inf, high: float = math.inf) -> float:
@@ -104,34 +143,40 @@ class Document:
         if not isinstance(values, list) or (count is not None and len(values) != count):
             found = _kind(values) if not isinstance(values, list) else f"{len(values)} values"
             much = "numbers" if count is None else f"{count} numbers"
-            raise self.fault(f"expected a list of {much}, found {found}", key)
+            self.refuse(f"expected a list of {much}, found {found}", key)
+            return [0.0] * (count or 0)
         return [self._finite(v, f"{key}[{k}]", -most, most) for k, v in enumerate(values)]
 
     def require_format(self, name: str) -> None:
         """Refuses a file that is of another kind or version."""
         if (found := self.take("format")) != name:
-            raise self.fault(f"expected {name!r}, found {_kind(found)}", "format")
+            self.refuse(f"expected {name!r}, found {_kind(found)}", "format", "other-version")
         version = self.take("version")
         if isinstance(version, bool) or not isinstance(version, int) or version != 1:
-            raise self.fault(
-                f"expected version 1, found {_kind(version)}; convert the file", "version"
-            )
+            rule = f"expected version 1, found {_kind(version)}; convert the file"
+            self.refuse(rule, "version", "other-version")
 
     def _finite(self, value: object, key: str, low: float, high: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.fault(f"expected a number, found {_kind(value)}", key)
+            self.refuse(f"expected a number, found {_kind(value)}", key)
+            value = min(max(0.0, low), high)
         number = float(value) if abs(value) < 1e300 else math.inf
         if not math.isfinite(number):
-            raise self.fault(f"expected a finite number, found {shown(value)}", key)
-        if not low <= number <= high:
-            raise self.fault(f"expected a number in {low:g} to {high:g}, found {number!r}", key)
+            self.refuse(f"expected a finite number, found {shown(value)}", key, "range")
+        elif not low <= number <= high:
+            rule = f"expected a number in {low:g} to {high:g}, found {number!r}"
+            self.refuse(rule, key, "range")
         return number
 
     def _short(self, value: str, key: str) -> str:
         size, most = len(value.encode()), budget_now().name_bytes
         if size > most:
-            raise self.fault(f"a name of {size} bytes; expected {most} at most", key)
+            self.refuse(f"a name of {size} bytes; expected {most} at most", key, "too-large")
         return value
+
+
+_NO_VALUE = object()
+"""Stands for a value that is not there, while faults are gathered."""
 
 
 def read_json(path: Path) -> Document:
@@ -261,7 +306,7 @@ def _refuse_more(what: str, found: int, most: int) -> None:
 def _unreadable(path: Path, kind: str, error: Exception) -> InputError:
     if isinstance(error, InputError):
         return error
-    return InputError(f"{path}: cannot be read as {kind} ({one_line(error)})")
+    return InputError(f"{path}: cannot be read as {kind} ({one_line(error)})", "unreadable")
 
 
 def _refuse_constant(name: str) -> float:

@@ -2,15 +2,54 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
-_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
+Code = Literal[
+    "other",
+    "missing-file",
+    "unreadable",
+    "too-large",
+    "other-version",
+    "missing-key",
+    "unknown-key",
+    "value",
+    "lens",
+    "missing-column",
+    "column-type",
+    "null",
+    "not-finite",
+    "unknown-name",
+    "name-twice",
+    "no-rows",
+    "order",
+    "range",
+    "far-away",
+    "leap",
+    "quaternion-length",
+    "unknown-frame",
+    "point-count",
+    "score",
+    "outside-image",
+    "not-clockwise",
+    "crosses-itself",
+    "no-area",
+    "off-axis",
+    "no-ray",
+    "few-points",
+    "no-length",
+    "copy",
+]
+"""Which rule of FORMAT.md is broken, for programs; texts are for people."""
 
 
 class InputError(ValueError):
     """Input that breaks FORMAT.md; one line: where, what was expected, what found, what to do."""
+
+    def __init__(self, text: str = "", code: Code = "other") -> None:
+        super().__init__(text)
+        self.code: Code = code
 
 
 def one_line(error: object) -> str:

@@ -8,7 +8,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
-from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.errors import Code, InputError
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,14 @@ class Fault:
     path: Path
     rule: str
     """What was expected and what found, in the first of the rows; or of the whole file."""
+    code: Code = "other"
+    """Which rule it is."""
     rows: tuple[int, ...] = ()
     """All rows in which it is so; none: it is the file's."""
     drops: bool = False
     """True: these rows are left out and the rest is used. False: the file is refused."""
+    column: str = ""
+    """The column that it is about, if it is one."""
 
 
 class FaultsGathered(InputError):
@@ -33,7 +37,7 @@ _GATHERED: ContextVar[list[Fault] | None] = ContextVar("faults", default=None)
 
 @contextmanager
 def gathering() -> Iterator[list[Fault]]:
-    """Inside, readers of Parquet files put faults into the list that this gives, and raise only where they cannot go on."""
+    """Inside, readers put faults into the list that this gives, and raise only where they cannot go on."""
     faults: list[Fault] = []
     token = _GATHERED.set(faults)
     try:
@@ -58,6 +62,4 @@ def attempted(path: Path) -> Iterator[None]:
     except FaultsGathered:
         pass
     except InputError as error:
-        text = str(error)
-        named = path if text.startswith(f"{path}: ") else None
-        faults.append(Fault(path, text if named is None else text.removeprefix(f"{path}: ")))
+        faults.append(Fault(path, str(error).removeprefix(f"{path}: "), error.code))

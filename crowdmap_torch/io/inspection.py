@@ -20,21 +20,22 @@ from crowdmap_torch.io.datasets import (
     journey_folders,
     read_journey_id,
     read_origin,
+    refuse_no_journey,
 )
 from crowdmap_torch.io.detections import read_lane_detections, read_sign_detections
 from crowdmap_torch.io.documents import read_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.faults import Fault, attempted, gathered, gathering
 from crowdmap_torch.io.poses import read_poses
-from crowdmap_torch.io.rigs import MAX_SIDE_PX, faults_of_rig
+from crowdmap_torch.io.rigs import MAX_SIDE_PX, faults_of_rig, missing_rig
 from crowdmap_torch.io.surveys import read_survey
 
 
 def inspect_dataset(folder: Path) -> tuple[Fault, ...]:
     """All faults of the files of a dataset, in the order of files; InputError if there is no such folder.
 
-    Of a Parquet file every wrong row is named, of dataset.json, journey.json and rig.yaml the first fault of each section,
-    of the survey the first one of all. Rows that the mapper leaves out are among them (`Fault.drops`).
+    Of a Parquet file every wrong row is named, of dataset.json, journey.json and rig.yaml every wrong key, of the survey the
+    first fault of all. Rows that the mapper leaves out are among them (`Fault.drops`).
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: the dataset's folder is missing; expected dataset.json in it")
@@ -53,19 +54,13 @@ def inspect_dataset(folder: Path) -> tuple[Fault, ...]:
 def _head(path: Path) -> None:
     with attempted(path):
         head = read_json(path)
-        with attempted(path):
-            head.require_format(DATASET_FORMAT)
-        with attempted(path):
-            read_origin(head)
+        head.require_format(DATASET_FORMAT)
+        read_origin(head)
 
 
 def _journey(folder: Path, rigs: Path, cameras: dict[str, Camera | None]) -> None:
     with attempted(folder):
-        refuse_way_out(folder)
-        if not folder.is_dir():
-            raise InputError(
-                f"{folder}: a link that leads to no folder; expected a journey's folder"
-            )
+        refuse_no_journey(folder)
         camera = _camera_of(folder / "journey.json", rigs, cameras)
         frames = _frames_of(folder / "poses.parquet")
         _detections(folder / "signs.parquet", read_sign_detections, camera, frames)
@@ -76,17 +71,18 @@ def _camera_of(path: Path, rigs: Path, cameras: dict[str, Camera | None]) -> Cam
     """The camera of a journey, if it is known; each rig is looked at once."""
     with attempted(path):
         head = read_json(path)
-        with attempted(path):
-            head.require_format(JOURNEY_FORMAT)
-        with attempted(path):
-            read_journey_id(head)
-        rig = rigs / head.name("rig")
+        head.require_format(JOURNEY_FORMAT)
+        read_journey_id(head)
+        name = head.name("rig")
+        if not head.is_known("rig"):
+            return None
+        rig = rigs / name
         if rig.name not in cameras:
             cameras[rig.name] = None
             with attempted(rig):
                 refuse_way_out(rig)
                 if not rig.is_dir():
-                    raise InputError(f"{rig}: the rig's folder is missing; expected rig.yaml in it")
+                    raise missing_rig(rig)
                 cameras[rig.name] = faults_of_rig(rig)
         return cameras[rig.name]
     return None
@@ -148,9 +144,11 @@ def _of_survey(folder: Path) -> Iterable[Fault]:
         text = str(error)
         path = next((p for p in sorted(survey.glob("*")) if text.startswith(f"{p}: ")), survey)
         if not text.startswith(f"{folder / 'dataset.json'}"):
-            yield Fault(path, text.removeprefix(f"{path}: "))
+            yield Fault(path, text.removeprefix(f"{path}: "), error.code)
         return
     if not origin.is_same(read.origin):
         yield Fault(
-            survey / "map.json", f"origin: {read.origin}; expected that of dataset.json, {origin}"
+            survey / "map.json",
+            f"origin: {read.origin}; expected that of dataset.json, {origin}",
+            "value",
         )

@@ -174,6 +174,7 @@ def read_corners(
             f"{polygon.SHAPES[int(shape[row])]} with {lists.count[row]} corners; "
             f"expected {expected[row]}"
         ),
+        code="point-count",
     )
     slot = np.minimum(np.arange(polygon.MAX_CORNERS), expected[:, None] - 1)
     padded = np.full((len(sheet), polygon.MAX_CORNERS, 3), np.nan)

@@ -116,7 +116,8 @@ def _read_map(folder: Path) -> HdMap:
 def read_map_head(folder: Path) -> Document:
     """The `map.json` of a map or survey, its format checked."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: the map's folder is missing; expected map.json in it")
+        rule = f"{folder}: the map's folder is missing; expected map.json in it"
+        raise InputError(rule, "missing-file")
     head = read_json(folder / "map.json")
     head.require_format(MAP_FORMAT)
     return head

@@ -49,7 +49,7 @@ def read_poses(path: Path) -> LinkPoses:
     required = ("frame", "t_ns", *_POSITION, *_QUATERNION)
     sheet = Sheet(path, required, (*_SIGMA_POSITION, _SIGMA_ROTATION))
     if not len(sheet):
-        raise sheet.fault("has no rows; expected one for each camera frame")
+        raise sheet.fault("has no rows; expected one for each camera frame", code="no-rows")
     frame, t_ns = (_increasing(sheet, name) for name in ("frame", "t_ns"))
     position = np.stack([sheet.numbers(name) for name in _POSITION], axis=-1)
     _refuse_far(sheet, position)
@@ -65,6 +65,7 @@ def read_poses(path: Path) -> LinkPoses:
             f"expected 1 within {UNIT_TOLERANCE}"
         ),
         *_QUATERNION,
+        code="quaternion-length",
     )
     R = se3.from_quaternion(torch.from_numpy(quaternion))
     sigmas = [_sigma(sheet, name) for name in _SIGMA_POSITION]
@@ -106,7 +107,8 @@ def _refuse_far(sheet: Sheet, position: Float[np.ndarray, "f 3"]) -> None:
             "metres east, north and up of dataset.json's. Are they UTM or earth-centred coordinates?"
         )
 
-    sheet.refuse(np.abs(position).max(axis=-1, initial=0.0) > MAX_PLACE_M, rule, *_POSITION)
+    far = np.abs(position).max(axis=-1, initial=0.0) > MAX_PLACE_M
+    sheet.refuse(far, rule, *_POSITION, code="far-away")
 
 
 def _refuse_leaps(
@@ -133,6 +135,7 @@ def _refuse_leaps(
             "Are positions in metres and t_ns in nanoseconds? Cut the journey where it jumps"
         ),
         *("frame", "t_ns", *_POSITION),
+        code="leap",
     )
 
 
@@ -142,6 +145,7 @@ def _increasing(sheet: Sheet, name: str) -> Int[np.ndarray, " f"]:
         np.abs(values.astype(float)) > _MOST_COUNTED,
         lambda row: f"column {name!r}: {values[row]}; expected {_MOST_COUNTED:g} at most",
         name,
+        code="range",
     )
     stays = np.concatenate(([False], values[1:] <= values[:-1]))
     sheet.refuse(
@@ -151,6 +155,7 @@ def _increasing(sheet: Sheet, name: str) -> Int[np.ndarray, " f"]:
             "expected strictly increasing values, sort the file by frame"
         ),
         name,
+        code="order",
     )
     return values
 
@@ -165,5 +170,6 @@ def _sigma(sheet: Sheet, name: str) -> Float[np.ndarray, " f"] | None:
             "leave it null if it is unknown"
         ),
         name,
+        code="range",
     )
     return np.where(known, sigma, np.median(sigma[known])) if known.any() else None

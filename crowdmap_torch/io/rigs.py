@@ -38,7 +38,7 @@ UNIT_TOLERANCE = 1e-3
 def read_rig(folder: Path) -> Rig:
     """The rig of a folder of `rigs/`; InputError for what breaks FORMAT.md."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: the rig's folder is missing; expected rig.yaml in it")
+        raise missing_rig(folder)
     rig = read_yaml(folder / "rig.yaml")
     rig.allow(("camera", "road"), ("mount",))
     camera = _read_camera(rig.part("camera"))
@@ -62,19 +62,22 @@ def read_camera(folder: Path) -> Camera:
     return _read_camera(rig.part("camera"))
 
 
+def missing_rig(folder: Path) -> InputError:
+    """What is said of a rig that is not there."""
+    rule = f"{folder}: the rig's folder is missing; expected rig.yaml in it"
+    return InputError(rule, "missing-file")
+
+
 def faults_of_rig(folder: Path) -> Camera | None:
-    """Gathers the first fault of each section of rig.yaml; the camera, if it can be used."""
+    """Gathers the faults of rig.yaml; the camera, if it can be used."""
     path, camera = folder / "rig.yaml", None
     with attempted(path):
         rig = read_yaml(path)
+        rig.allow(("camera", "road"), ("mount",))
         with attempted(path):
-            rig.allow(("camera", "road"), ("mount",))
+            camera = _read_camera(rig.part("camera"))
         with attempted(path):
-            if "camera" in rig.content:
-                camera = _read_camera(rig.part("camera"))
-        with attempted(path):
-            if "road" in rig.content:
-                _read_road(rig.part("road"))
+            _read_road(rig.part("road"))
         with attempted(path):
             if "mount" in rig.content:
                 _read_mount(rig.part("mount"), folder)
@@ -153,18 +156,21 @@ def _read_camera(section: Document) -> Camera:
     section.allow(("model", "width", "height", "fx", "fy", "cx", "cy", "distortion"))
     model = section.text("model")
     if model not in MODELS:
-        raise section.fault(f"expected one of {', '.join(MODELS)}, found {model!r}", "model")
+        rule = f"expected one of {', '.join(MODELS)}, found {model!r}"
+        section.refuse(rule, "model", "unknown-name")
     distortion = section.numbers("distortion", most=MAX_COEFFICIENT)
-    if len(distortion) not in (counts := COEFFICIENT_COUNTS[model]):
+    if model in MODELS and len(distortion) not in (counts := COEFFICIENT_COUNTS[model]):
         much = ", ".join(map(str, counts))
         rule = f"expected {much} numbers for {model}, found {len(distortion)}"
-        raise section.fault(rule, "distortion")
+        section.refuse(rule, "distortion", "point-count")
     fx, fy = (section.number(key, low=1.0, high=MAX_FOCAL_PX) for key in ("fx", "fy"))
     cx, cy = (section.number(key, low=-MAX_FOCAL_PX, high=MAX_FOCAL_PX) for key in ("cx", "cy"))
+    width, height = (section.integer(key, low=2, high=MAX_SIDE_PX) for key in ("width", "height"))
+    section.require_sound()
     camera = Camera(
         model=model,
-        width=section.integer("width", low=2, high=MAX_SIDE_PX),
-        height=section.integer("height", low=2, high=MAX_SIDE_PX),
+        width=width,
+        height=height,
         K=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
         distortion=torch.tensor(distortion, dtype=torch.float64),
     )
@@ -174,6 +180,7 @@ def _read_camera(section: Document) -> Camera:
             f"expected {MIN_CLOSING_SHARE:.0%} or more. "
             "Are the coefficients in OpenCV's order, and fx, fy, cx, cy of this image size?",
             "distortion",
+            "lens",
         )
     return camera
 
@@ -183,13 +190,16 @@ def _read_road(section: Document) -> tuple[Float[Tensor, " 3"], float]:
     normal = torch.tensor(section.numbers("normal", 3, most=2.0), dtype=torch.float64)
     length = math.hypot(*normal.tolist())
     if abs(length - 1) > UNIT_TOLERANCE:
-        raise section.fault(f"expected a unit vector, found one of length {length:.6g}", "normal")
-    return normal / length, section.number("height_m", low=MIN_HEIGHT_M, high=MAX_HEIGHT_M)
+        section.refuse(f"expected a unit vector, found one of length {length:.6g}", "normal")
+    height = section.number("height_m", low=MIN_HEIGHT_M, high=MAX_HEIGHT_M)
+    section.require_sound()
+    return normal / length, height
 
 
 def _read_mount(section: Document, folder: Path) -> Float[Tensor, "4 4"]:
     section.allow(("urdf", "pose_link", "camera_link"))
-    name = section.place("urdf")
+    name, links = section.place("urdf"), [section.text(k) for k in ("pose_link", "camera_link")]
+    section.require_sound()
     path = folder / name
     # Resolved, so that neither `..` nor a link leads out of the rig's folder.
     inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
@@ -197,7 +207,7 @@ def _read_mount(section: Document, folder: Path) -> Float[Tensor, "4 4"]:
         raise section.fault(f"expected a file inside the rig's folder, found {name!r}", "urdf")
     content = read_bytes(path)
     try:
-        T = camera_in_link(content, section.text("pose_link"), section.text("camera_link"))
+        T = camera_in_link(content, *links)
     except ValueError as error:
         if isinstance(error, InputError):
             raise

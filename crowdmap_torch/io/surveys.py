@@ -30,7 +30,9 @@ def _read_survey(folder: Path) -> Survey:
     signs_path, lanes_path = folder / "signs.parquet", folder / "lanes.parquet"
     has_signs, has_lanes = (os.path.lexists(path) for path in (signs_path, lanes_path))
     if not has_signs and not has_lanes:
-        raise InputError(f"{folder}: has neither signs.parquet nor lanes.parquet; expected one")
+        raise InputError(
+            f"{folder}: has neither signs.parquet nor lanes.parquet; expected one", "missing-file"
+        )
     sign_id, signs = _read_signs(signs_path) if has_signs else ((), _no_signs())
     lane_id, lane_type, lane_points = (), _integers(), _no_points()
     if has_lanes:
@@ -53,7 +55,9 @@ def _read_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
     centers = sheet.points("center", optional=True)
     has_center = centers.count > 0
     sheet.refuse(
-        ~has_corners & ~has_center, lambda row: "neither corners nor a center; expected one of them"
+        ~has_corners & ~has_center,
+        lambda row: "neither corners nor a center; expected one of them",
+        code="null",
     )
     center = center_of(corners, polygon.corner_mask(shape)).numpy()
     # Corners are the better witness: where they are known the centre is their mean.
@@ -76,6 +80,7 @@ def _read_lanes(path: Path) -> tuple[tuple[str, ...], torch.Tensor, SurveyLanePo
     sheet.refuse(
         points.count < 2,
         lambda row: f"column 'points': {points.count[row]} points; expected 2 or more",
+        code="point-count",
     )
     lane_type = sheet.codes("type", LANE_TYPES, optional=True)
     order = _by_id(lane_id)

@@ -36,6 +36,7 @@ def _finding(item: Item) -> dict[str, Any]:
     return {
         "severity": item.severity,
         "kind": item.kind,
+        "codes": list(item.codes),
         "journeys": list(item.journeys),
         "file": item.file or None,
         "rows": list(item.rows),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import yaml
 
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.errors import InputError
@@ -56,8 +58,12 @@ def test_every_wrong_row_of_every_column_is_named(bad: Path) -> None:
     t_ns[3] = t_ns[2]
     for name, column in (("x", x), ("qw", qw), ("t_ns", t_ns)):
         changed(path, name, column)
-    found = {fault.rule.split(":")[0].split(" has ")[0]: fault.rows for fault in refused(bad)}
-    assert found == {"column 't_ns'": (3,), "column 'x'": (2, 7), "quaternion qx qy qz qw": (4, 5)}
+    found = {(fault.code, fault.column): fault.rows for fault in refused(bad)}
+    assert found == {
+        ("order", "t_ns"): (3,),
+        ("not-finite", "x"): (2, 7),
+        ("quaternion-length", ""): (4, 5),
+    }
     assert {fault.path for fault in refused(bad)} == {path}
 
 
@@ -69,11 +75,10 @@ def test_a_wrong_type_and_a_missing_column_hide_nothing_else(bad: Path) -> None:
     table = table.set_column(table.column_names.index("x"), "x", table["x"].cast(pa.float32()))
     table = table.set_column(table.column_names.index("z"), "z", pa.array(z)).drop_columns(["qz"])
     pq.write_table(table, path)
-    rules = [fault.rule for fault in refused(bad)]
-    assert [rule[:24] for rule in rules] == [
-        "column 'qz' is missing; ",
-        "column 'x' has type floa",
-        "column 'z': expected a f",
+    assert [(fault.code, fault.column) for fault in refused(bad)] == [
+        ("missing-column", "qz"),
+        ("column-type", "x"),
+        ("not-finite", "z"),
     ]
 
 
@@ -92,17 +97,49 @@ def test_a_broken_rig_and_broken_poses_do_not_keep_detections_from_being_looked_
     assert found == {("rig.yaml", ()), ("poses.parquet", ()), ("signs.parquet", (1,))}
 
 
-def test_every_section_of_a_text_file_is_looked_at(bad: Path) -> None:
+def test_every_wrong_key_of_a_text_file_is_named_once(bad: Path) -> None:
     head = json.loads((bad / "dataset.json").read_text())
-    (bad / "dataset.json").write_text(json.dumps({**head, "version": 2, "origin": {}}))
+    origin = {"lat_deg": 91, "lon_deg": "east"}
+    wrong = {"format": "map", "version": 2, "origin": origin}
+    (bad / "dataset.json").write_text(json.dumps(head | wrong))
     rig = next(iter(sorted(bad.glob("rigs/*/rig.yaml"))))
-    rig.write_text(rig.read_text().replace("brown_conrady", "lomo").replace("height_m", "height"))
-    rules = [fault.rule for fault in refused(bad)]
-    assert [rule.split(":")[0] for rule in rules] == [
-        "version",
-        "origin.lat_deg",
-        "camera.model",
-        "road",
+    content = yaml.safe_load(rig.read_text())
+    camera, road = content["camera"], content["road"]
+    camera |= {"model": "lomo", "fx": 0.5, "cy": None, "distortion": [1, "k2", "k3"], "fov": 90}
+    del camera["width"]
+    content["road"] = {"normal": [0, 0.5, 0], "height": road["height_m"]}
+    rig.write_text(yaml.safe_dump(content | {"mount": 3}))
+    journey = bad / "journeys" / "journey-001" / "journey.json"
+    journey.write_text(json.dumps({"format": "crowdmap-journey", "version": True, "rig": "../rig"}))
+    assert [(f.path.name, f.code, re.split("is |: e", f.rule)[0]) for f in refused(bad)] == [
+        ("dataset.json", "other-version", "format"),
+        ("dataset.json", "other-version", "version"),
+        ("dataset.json", "range", "origin.lat_deg"),
+        ("dataset.json", "value", "origin.lon_deg"),
+        ("dataset.json", "missing-key", "origin.height_m: "),
+        ("rig.yaml", "missing-key", "camera: key 'width' "),
+        ("rig.yaml", "unknown-key", "camera: key 'fov' "),
+        ("rig.yaml", "unknown-name", "camera.model"),
+        ("rig.yaml", "value", "camera.distortion[1]"),
+        ("rig.yaml", "range", "camera.fx"),
+        ("rig.yaml", "value", "camera.cy"),
+        ("rig.yaml", "missing-key", "road: key 'height_m' "),
+        ("rig.yaml", "unknown-key", "road: key 'height' "),
+        ("rig.yaml", "value", "road.normal"),
+        ("rig.yaml", "value", "mount"),
+        ("journey.json", "other-version", "version"),
+        ("journey.json", "missing-key", "journey_id: "),
+        ("journey.json", "value", "rig"),
+    ]
+
+
+def test_a_section_that_is_no_mapping_is_one_fault(bad: Path) -> None:
+    (bad / "dataset.json").write_text('{"format": "crowdmap-dataset", "version": 1, "origin": []}')
+    rig = next(iter(sorted(bad.glob("rigs/*/rig.yaml"))))
+    rig.write_text("road: {normal: [0, 1, 0], height_m: 1.4}\n")
+    assert [(fault.path.name, fault.code) for fault in refused(bad)] == [
+        ("dataset.json", "value"),
+        ("rig.yaml", "missing-key"),
     ]
 
 
