@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -88,6 +89,17 @@ def winding_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("winding") / "good"
     write_dataset(winding_street(), folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def winding_pair(winding_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two of them, one of each rig: enough for what shows in every drive."""
+    journeys = sorted((winding_folder / "journeys").iterdir())[:2]
+    left_out = {p.name for p in (winding_folder / "journeys").iterdir()} - {
+        p.name for p in journeys
+    }
+    place = tmp_path_factory.mktemp("winding") / "pair"
+    return Path(shutil.copytree(winding_folder, place, ignore=lambda *_: left_out))
 
 
 @pytest.fixture(scope="session")

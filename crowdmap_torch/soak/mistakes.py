@@ -19,7 +19,6 @@ import torch
 
 from crowdmap_torch.checking.check import NOTE, Check, check_dataset
 from crowdmap_torch.checking.repair import write_repaired
-from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.soak.spoiled import MISTAKES, spoiled
 from crowdmap_torch.soak.varied import GOOD, write_good_set
 from crowdmap_torch.tables import Dataset, Journey
@@ -72,11 +71,12 @@ def run(options: argparse.Namespace) -> int:
             good = folder / set_name.replace(" ", "-")
             if not good.exists():
                 write_good_set(set_name, good)
-            found = grave(check_dataset(good))
+            sound = check_dataset(good)
+            found = grave(sound)
             alarms += bool(found)
             print(f"{set_name}: {', '.join(sorted(found)) or 'nothing found'}", flush=True)
             for mistake in () if set_name in _FEW else options.only:
-                outcome = attempt(good, Path(temporary) / "attempt", mistake)
+                outcome = attempt(good, sound.dataset, Path(temporary) / "attempt", mistake)
                 tried[mistake] += 1
                 named[mistake] += outcome.named
                 cured[mistake] += outcome.cured
@@ -95,8 +95,8 @@ def run(options: argparse.Namespace) -> int:
     return 1 if alarms or short else 0
 
 
-def attempt(good: Path, place: Path, mistake: str) -> Outcome:
-    """Makes a mistake on a copy of a good set, checks that, and puts it right."""
+def attempt(good: Path, drives: Dataset | None, place: Path, mistake: str) -> Outcome:
+    """Makes a mistake on a copy of a good set, whose drives these are, checks that, and puts it right."""
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
     bad = spoiled(good, place / "bad", mistake)
@@ -109,7 +109,7 @@ def attempt(good: Path, place: Path, mistake: str) -> Outcome:
         return Outcome(is_named, False, told)
     mended = write_repaired(bad, place / "new", check)
     left = grave(mended.check)
-    away = differences(good, place / "new")
+    away = differences(drives, mended.check.dataset)
     near = is_near(away, mistake)
     far = ", ".join(f"{name} {value:.2g}" for name, value in away.items())
     return Outcome(
@@ -135,9 +135,10 @@ def is_near(away: Mapping[str, float], mistake: str) -> bool:
     return all(value <= allowed[name] for name, value in away.items())
 
 
-def differences(good: Path, mended: Path) -> dict[str, float]:
-    """How far the drives of a set that was put right are from those of the good one, at most."""
-    ours, theirs = load_dataset(mended), load_dataset(good)
+def differences(theirs: Dataset | None, ours: Dataset | None) -> dict[str, float]:
+    """How far the drives of a set that was put right are from those of the good one, at most; None: it has none."""
+    if theirs is None or ours is None:
+        return dict.fromkeys((*NEAR, "detections"), float("inf"))
     away = dict.fromkeys((*NEAR, "detections"), 0.0)
     for a, b in _pairs(ours, theirs):
         for name, value in _of_journeys(a, b):

@@ -10,15 +10,23 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.soak.spoiled import spoiled
+from crowdmap_torch.tables import Dataset
 
 Spoil = Callable[[str], Path]
 
 
 @pytest.fixture
-def spoil(winding_folder: Path, tmp_path: Path) -> Spoil:
-    """A copy of a good data set with a mistake."""
-    return lambda mistake: spoiled(winding_folder, tmp_path / mistake, mistake)
+def spoil(winding_pair: Path, tmp_path: Path) -> Spoil:
+    """A copy of a good data set of two drives with a mistake."""
+    return lambda mistake: spoiled(winding_pair, tmp_path / mistake, mistake)
+
+
+@pytest.fixture(scope="session")
+def drives(winding_pair: Path) -> Dataset:
+    """Those without a mistake."""
+    return load_dataset(winding_pair)
 
 
 @pytest.fixture

@@ -15,19 +15,19 @@ def check(*arguments: object) -> int:
     return main(["check", *map(str, arguments)])
 
 
-def test_a_good_data_set_ends_with_0(winding_folder: Path, tmp_path: Path, capsys) -> None:
+def test_a_good_data_set_ends_with_0(winding_pair: Path, tmp_path: Path, capsys) -> None:
     new = tmp_path / "new"
-    assert check(winding_folder, "--fix", new) == 0
+    assert check(winding_pair, "--fix", new) == 0
     said = capsys.readouterr()
-    assert "4 journeys can be used" in said.out and not said.err
+    assert "2 journeys can be used" in said.out and not said.err
     assert f"nothing to put right: {new} is not written" in said.out and not new.exists()
 
 
 def test_findings_are_told_with_their_cures_written_and_put_right(
-    winding_folder: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+    winding_pair: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("crowdmap_torch.report.check.MOST_JOURNEYS", 0)
-    bad = spoiled(winding_folder, tmp_path / "bad", "centimetres-high")
+    bad = spoiled(winding_pair, tmp_path / "bad", "centimetres-high")
     report, page, new = (tmp_path / name for name in ("found.json", "found.html", "new"))
     assert check(bad, "--json", report) == 4
     said = capsys.readouterr()
@@ -39,7 +39,8 @@ def test_findings_are_told_with_their_cures_written_and_put_right(
         "spoils",
         True,
     )
-    assert len(finding["journeys"]) == 4 and finding["cure"]
+    assert finding["codes"] == []
+    assert len(finding["journeys"]) == 2 and finding["cure"]
 
     assert check(bad, "--json", report, "--html", page, "--fix", new) == 0
     said = capsys.readouterr()

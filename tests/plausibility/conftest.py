@@ -20,16 +20,16 @@ Look = Callable[[Path], dict[str, Finding]]
 
 
 @pytest.fixture
-def good(winding_folder: Path) -> Path:
+def good(winding_pair: Path) -> Path:
     """Drives without a mistake, of vehicles that are as they say."""
-    return winding_folder
+    return winding_pair
 
 
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same by vehicles that have wrong what real ones have, twice as large."""
     folder = tmp_path_factory.mktemp("plausibility") / "fleet"
-    write_dataset(with_errors(winding_street(), (ALL,), 2.0), folder)
+    write_dataset(with_errors(winding_street(journeys=2), (ALL,), 2.0), folder)
     return folder
 
 
