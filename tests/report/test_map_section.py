@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from worlds.browser import browser, browser_path
 
+from crowdmap_torch.benchmark.browser import browser, browser_path
 from crowdmap_torch.report.html import report_html, write_report
 from crowdmap_torch.report.map_section import map_section
 from crowdmap_torch.report.record import RunRecord

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from worlds.browser import NAMES, Page, browser, browser_path
 
+from crowdmap_torch.benchmark.browser import NAMES, Page, browser, browser_path
 from crowdmap_torch.tables import Dataset
 from crowdmap_torch.viewer.page import write_page
 from crowdmap_torch.viewer.scene import Scene, scene_of_dataset
@@ -130,3 +130,21 @@ def test_frames_of_a_data_set_are_gone_through(page: Page, tiny: Dataset, tmp_pa
     assert page.ask(f"{V}.state.chosen.row") == 1
     assert "sigma as stated" in page.ask(DETAIL)
     assert page.complaints() == []
+
+
+def test_what_is_left_out_is_out_of_sight(page: Page, file: Path) -> None:
+    """Boxes that the view does not see have no point on the canvas, from above and in 3D; and it leaves some out."""
+    show(page, file)
+    counts = page.ask(
+        f"(() => {{ const v = {V}.view; let left = 0, wrong = 0, seed = 1;"
+        "const random = () => (seed = (seed * 16807) % 2147483647) / 2147483647;"
+        "for (let k = 0; k < 4000; k++) { v.solid = k % 2 > 0; v.turn = 6.3 * random(); v.pitch = 1.5 * random();"
+        " v.look(40, 0, 0, 0.5 + 40 * random());"
+        " const b = [0, 1].map(() => 400 * random() - 200), s = 20 * random(), z = 8 * random() - 4;"
+        " if (v.sees([b[0], b[1], b[0] + s, b[1] + s, z, z + 2])) continue; left++;"
+        " for (let j = 0; j < 20; j++) { const p = v.project(b[0] + s * random(), b[1] + s * random(), z + 2 * random());"
+        " if (p[2] > 0.4 && (!v.solid || p[2] < 0.7 * v.far)"
+        " && p[0] > 0 && p[1] > 0 && p[0] < v.width && p[1] < v.height) wrong++; } }"
+        " return [left, wrong]; })()"
+    )
+    assert counts[0] > 1000 and counts[1] == 0

@@ -1,6 +1,7 @@
 // From metres to pixels of the canvas: from above, or in perspective around a point on the ground.
 
 const NEAR = 0.4; // metres before the eye where lines are cut off
+const MARGIN = 8; // pixels around the canvas that lines may reach into it from
 const SHORTEST = 1.5, LONGEST = 200000; // from the eye to what it looks at
 
 class View {
@@ -26,6 +27,7 @@ class View {
       this.m = [k * c, k * s, -k * ahead[0], -k * ahead[1]];
       this.m.push(this.width / 2 - this.m[0] * this.x - this.m[1] * this.y);
       this.m.push(this.height / 2 - this.m[2] * this.x - this.m[3] * this.y);
+      this.box = this.reach();
       return;
     }
     const cp = Math.cos(this.pitch), sp = Math.sin(this.pitch);
@@ -35,6 +37,26 @@ class View {
     this.far = Math.max(12 * this.distance, 400);
     const at = [this.x, this.y, this.z];
     this.eye = at.map((v, i) => v - this.distance * this.forward[i]);
+    // Inward normals of the four sides of what is seen, and of the near side.
+    const w = this.width / 2 + MARGIN, h = this.height / 2 + MARGIN, f = this.focal, n = this.forward;
+    const side = (axis, sign, half) => axis.map((v, i) => sign * f * v + half * n[i]);
+    this.sides = [side(this.right, 1, w), side(this.right, -1, w), side(this.up, 1, h), side(this.up, -1, h), n];
+  }
+
+  // Whether a box (east and north from, to; up from, to) may be in sight.
+  sees(b) {
+    if (!this.solid) {
+      const r = this.box;
+      return b[2] >= r[0] && b[0] <= r[2] && b[3] >= r[1] && b[1] <= r[3];
+    }
+    const [x, y, z] = this.eye;
+    const dx = Math.max(b[0] - x, x - b[2], 0), dy = Math.max(b[1] - y, y - b[3], 0);
+    if (dx * dx + dy * dy > this.far * this.far) return false;
+    for (const n of this.sides) {
+      const a = (n[0] > 0 ? b[2] : b[0]) - x, c = (n[1] > 0 ? b[3] : b[1]) - y, d = (n[2] > 0 ? b[5] : b[4]) - z;
+      if (n[0] * a + n[1] * c + n[2] * d < 0) return false;
+    }
+    return true;
   }
 
   // [x, y, depth]; nothing that is nearer than NEAR can be drawn. From above the depth is one.

@@ -39,7 +39,6 @@ class Painter {
     ctx.globalAlpha = 1;
     ctx.fillStyle = theme.back;
     ctx.fillRect(0, 0, view.width, view.height);
-    ctx.lineJoin = ctx.lineCap = 'round';
     this.box = view.reach();
     this.taken = new Set();
     if (view.solid) this.horizon();
@@ -83,6 +82,9 @@ class Painter {
     const { ctx } = this;
     ctx.strokeStyle = color;
     ctx.lineWidth = width;
+    // Of thin lines nobody sees how they are joined, and round joins take half of the time.
+    ctx.lineJoin = width < 2 ? 'bevel' : 'round';
+    ctx.lineCap = width < 2 ? 'butt' : 'round';
     ctx.globalAlpha = alpha;
     ctx.setLineDash(dash);
     ctx.stroke();
@@ -111,13 +113,13 @@ class Painter {
 
   // Adds to the path what of a line can be seen, as finely as a pixel shows.
   trace(line) {
-    const { ctx, view, box } = this, points = line.points, m = view.m;
+    const { ctx, view } = this, points = line.points, m = view.m;
     let level = TOLERANCES.length - 1;
     while (level && TOLERANCES[level] * view.scale > 0.7) level--;
     let joined = false;
     for (const piece of line.pieces) {
       const b = piece.box;
-      if (b[2] < box[0] || b[0] > box[2] || b[3] < box[1] || b[1] > box[3]) {
+      if (!view.sees(b)) {
         joined = false;
         continue;
       }
@@ -189,12 +191,12 @@ class Painter {
 
   // In perspective dashes are as long as on the road, and far away a paler line.
   dashesSolid(lines, wide) {
-    const { ctx, view, theme, box } = this, far = [];
+    const { ctx, view, theme } = this, far = [];
     ctx.beginPath();
     for (const line of lines) {
       for (const piece of line.pieces) {
         const b = piece.box;
-        if (b[2] < box[0] || b[0] > box[2] || b[3] < box[1] || b[1] > box[3]) continue;
+        if (!view.sees(b)) continue;
         if (boxWay(b, view.eye) > DASHES_M) far.push([line.points, piece.levels[this.nearLevel(b)]]);
         else this.dashes(line.points, piece);
       }
@@ -229,8 +231,7 @@ class Painter {
     ctx.globalAlpha = 0.16;
     for (const lane of model.lanes) {
       for (const piece of lane.pieces) {
-        const b = piece.box;
-        if (b[2] < this.box[0] || b[0] > this.box[2] || b[3] < this.box[1] || b[1] > this.box[3]) continue;
+        if (!view.sees(piece.box)) continue;
         this.fillPolygon(bandOf(lane, piece, factor));
       }
     }
@@ -280,16 +281,26 @@ class Painter {
       return;
     }
     if (view.scale < FAR_PLATES) {
-      const size = view.scale < 0.3 ? 3 : 5;
-      for (const [sign, p] of shown) {
-        ctx.fillStyle = sign.true === -2 ? theme.bad : theme.map;
-        ctx.fillRect(p[0] - size / 2, p[1] - size / 2, size, size);
-      }
+      const size = view.scale < 0.3 ? 3 : 5, wrong = shown.filter(([sign]) => sign.true === -2);
+      this.dots(shown, theme.map, size);
+      this.dots(wrong, theme.bad, size);
       return;
     }
     this.platesAbove(model.signs, theme.map, 3);
     if (view.scale >= FAR_LABELS) for (const [sign, p] of shown) this.icon(sign, p);
     this.names(shown);
+  }
+
+  // Squares of `size` pixels, one where several would cover one another.
+  dots(shown, color, size) {
+    const { ctx } = this, taken = new Set();
+    ctx.fillStyle = color;
+    for (const [, p] of shown) {
+      const x = Math.round(p[0] - size / 2), y = Math.round(p[1] - size / 2), key = x * 65536 + y;
+      if (taken.has(key)) continue;
+      taken.add(key);
+      ctx.fillRect(x, y, size, size);
+    }
   }
 
   // From above a plate is a stroke as wide as the plate, with another one to where it faces.
@@ -396,19 +407,23 @@ class Painter {
     ctx.restore();
   }
 
+  // Outlines as surveyed; from above circles, from far those alone that the map lacks.
   surveySigns() {
-    const { ctx, model, theme, view } = this;
+    const { ctx, model, theme, view } = this, far = !view.solid && view.scale < FAR_PLATES, dots = [];
     ctx.beginPath();
     for (const sign of model.survey) {
       const p = this.place(sign);
       if (!p) continue;
+      if (view.solid && this.local(p) * 0.3 < 1) continue;
       if (view.solid) sign.corners.forEach((c, k) => this.segment(c, sign.corners[(k + 1) % sign.corners.length]));
-      if (!view.solid || !sign.corners.length) {
+      if (far && sign.found) dots.push([sign, p]);
+      else if (!view.solid || !sign.corners.length) {
         ctx.moveTo(p[0] + 7, p[1]);
         ctx.arc(p[0], p[1], 7, 0, 2 * Math.PI);
       }
     }
-    this.stroke(theme.survey, 2, 1);
+    this.stroke(theme.survey, far ? 1.2 : 2, 1);
+    this.dots(dots, theme.survey, 5);
   }
 
   beforeSigns() {
@@ -429,8 +444,9 @@ class Painter {
     const { ctx, model, theme, state } = this;
     ctx.beginPath();
     for (const sign of model.signs) {
-      if (!(sign.true >= 0) || !this.place(sign)) continue;
-      const e = sign.error, k = state.magnify, from = [sign.x - e[0], sign.y - e[1], sign.z - e[2]];
+      const p = sign.true >= 0 && this.place(sign), e = sign.error, k = state.magnify;
+      if (!p || k * sign.errorM * this.local(p) < 1) continue;
+      const from = [sign.x - e[0], sign.y - e[1], sign.z - e[2]];
       this.segment(from, from.map((v, i) => v + k * e[i]));
     }
     this.stroke(theme.bad, 2.2, 1);
@@ -587,11 +603,9 @@ class Painter {
   }
 
   wayTo(line, px, py) {
-    const { box } = this;
     let least = Infinity;
     for (const piece of line.pieces) {
-      const b = piece.box;
-      if (b[2] < box[0] || b[0] > box[2] || b[3] < box[1] || b[1] > box[3]) continue;
+      if (!this.view.sees(piece.box)) continue;
       for (let k = piece.a; k < piece.b; k++) {
         const p = this.view.project(...line.points.subarray(3 * k, 3 * k + 3));
         const q = this.view.project(...line.points.subarray(3 * k + 3, 3 * k + 6));

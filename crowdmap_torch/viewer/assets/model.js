@@ -25,6 +25,7 @@ function buildModel({ head, columns }) {
   const own = new Map(model.before.map((sign) => [sign.id, sign]));
   model.signs.forEach((sign) => { sign.before = own.get(sign.id); });
   model.survey = readSurvey(head, column);
+  for (const sign of model.signs) if (sign.true >= 0) model.survey[sign.true].found = true;
   const types = (name) => Array.from(column(name));
   model.lanes = readLines(column, 'lane', types('lane.type'), head.lane_id);
   model.lanes.forEach((lane, k) => {
@@ -120,13 +121,15 @@ function readLines(column, name, types, ids) {
 function piecesOf(points) {
   const last = points.length / 3 - 1, pieces = [];
   for (let a = 0; a < last; a += PIECE) {
-    const b = Math.min(a + PIECE, last), box = [Infinity, Infinity, -Infinity, -Infinity];
+    const b = Math.min(a + PIECE, last), box = [Infinity, Infinity, -Infinity, -Infinity, Infinity, -Infinity];
     for (let k = a; k <= b; k++) {
-      const x = points[3 * k], y = points[3 * k + 1];
+      const x = points[3 * k], y = points[3 * k + 1], z = points[3 * k + 2];
       if (x < box[0]) box[0] = x;
       if (y < box[1]) box[1] = y;
       if (x > box[2]) box[2] = x;
       if (y > box[3]) box[3] = y;
+      if (z < box[4]) box[4] = z;
+      if (z > box[5]) box[5] = z;
     }
     pieces.push({ a, b, box, levels: TOLERANCES.map((t) => thinned(points, a, b, t)) });
   }
