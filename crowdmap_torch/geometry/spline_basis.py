@@ -13,8 +13,10 @@ splines to points, `spline_length` measures along them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 _SOLVE_STEPS = 6
@@ -61,29 +63,37 @@ def window_with_curvature(
     u = inside - span
     over = t - inside
     v = 1 - u
-    b = torch.stack((v**3, 4 - 3 * u**2 * (2 - u), 4 - 3 * v**2 * (2 - v), u**3), dim=-1) / 6
-    d = torch.stack((-(v**2), u * (3 * u - 4), v * (4 - 3 * v), u**2), dim=-1) / 2
-    dd = torch.stack((v, 3 * u - 2, 3 * v - 2, u), dim=-1)
+    uu, vv = u * u, v * v
+    b = (v * vv / 6, (4 - 3 * uu * (2 - u)) / 6, (4 - 3 * vv * (2 - v)) / 6, u * uu / 6)
+    d = (-vv / 2, u * (3 * u - 4) / 2, v * (4 - 3 * v) / 2, uu / 2)
+    dd = (v, 3 * u - 2, 3 * v - 2, u)
 
-    # The coefficient each weight belongs to; those of a ghost -1 or C go to its neighbour twice
-    # and, negative, to the next.
-    slot = torch.arange(4, device=t.device)
-    coefficient = span[..., None] - 1 + slot
-    last = last.expand(t.shape)[..., None]
-    ghost = (coefficient < 0) | (coefficient > last)
-    near = torch.minimum(coefficient.clamp_min(0), last)
-    next_to_ghost = torch.where(coefficient < 0, torch.ones_like(near), (last - 1).expand_as(near))
-    far = torch.where(ghost, next_to_ghost, near)
-    start = torch.minimum(span - 1, last[..., 0] - 3).clamp_min(0)
-    near_share = torch.where(ghost, 2.0, 1.0).to(t)
-    far_share = torch.where(ghost, -1.0, 0.0).to(t)
-    # fold[k, j]: how much of weight k goes to slot j
-    fold = near_share[..., None] * (near[..., None] == start[..., None, None] + slot)
-    fold = fold + far_share[..., None] * (far[..., None] == start[..., None, None] + slot)
-    b, d, dd = ((part[..., None] * fold).sum(-2) for part in (b, d, dd))
+    # Of the coefficients from span - 1 to span + 2 the first may be before the spline and the last behind it: such a ghost
+    # is its neighbour twice, less the next. What is left of four begins one further on, or before.
+    start = torch.minimum(span - 1, last - 3).clamp_min(0)
+    before, behind, shift = span == 0, span == last - 1, start - span + 1
+    b, d, dd = (_folded(part, before, behind, shift) for part in (b, d, dd))
     # Straight on beyond the ends.
     outside = (over != 0)[..., None]
     return start, b + over[..., None] * d, d, torch.where(outside, 0.0, dd)
+
+
+def _folded(
+    weight: Sequence[Float[Tensor, "*batch"]],
+    before: Bool[Tensor, "*batch"],
+    behind: Bool[Tensor, "*batch"],
+    shift: Int[Tensor, "*batch"],
+) -> Float[Tensor, "*batch 4"]:
+    """The weights of four slots, from those of four coefficients of which the first or the last may be a ghost."""
+    first, second, third, fourth = weight
+    ahead, after = torch.where(before, first, 0.0), torch.where(behind, fourth, 0.0)
+    first, fourth = first - ahead, fourth - after
+    second, third = second + 2 * ahead - after, third - ahead + 2 * after
+    nothing = torch.zeros_like(first)
+    padded = (nothing, first, second, third, fourth, nothing)
+    on, back = shift > 0, shift < 0
+    slots = zip(padded, padded[1:], padded[2:], strict=False)
+    return torch.stack([torch.where(on, c, torch.where(back, a, b)) for a, b, c in slots], dim=-1)
 
 
 def window_flat(
