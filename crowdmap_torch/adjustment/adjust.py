@@ -235,7 +235,7 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     state = lm.step(problem, state, bundle.config.lm, backend=backend)
     if not bool(state.accepted.all()):
         return state, state.done
-    evidence = pose_evidence(bundle.prior, normal, bundle.prior_scale)
+    evidence = pose_evidence(bundle.prior, normal, bundle.prior_scale, bundle.told())
     bundle.fold(dict(state.values))
     at_rest = bundle.refresh(evidence)
     if at_rest and (state.done or int(bundle.judged) == 0):

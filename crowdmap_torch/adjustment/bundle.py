@@ -7,23 +7,23 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from crowdmap_torch.adjustment.calibration import ByOptics
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.landmark_terms import size_class_term, slide_term
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
+from crowdmap_torch.adjustment.lane_terms import lane_point_terms
 from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
 from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
 from crowdmap_torch.adjustment.shared_corner_errors import (
-    CornerDetections,
-    corner_detections,
+    KeptDetections,
     lasting_variance,
     shared_errors,
 )
-from crowdmap_torch.geometry import se3, spline_basis
+from crowdmap_torch.geometry import se3
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, white_scales
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
@@ -42,7 +42,7 @@ from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBac
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
-from crowdmap_torch.residuals import lane, reprojection
+from crowdmap_torch.residuals import reprojection
 from crowdmap_torch.tables import to_device
 
 _PIXEL_DIM = 2
@@ -53,8 +53,12 @@ _MOST_JUDGEMENTS = 2
 """Detections are judged no more often than this, should some of them come and go."""
 _NARROWS = 0.97
 """A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
-_SCALE_RESTS = 0.005
-"""A scale of the prior that would change by less than this share is at rest."""
+_SCALE_STAYS = 0.005
+"""A scale of the prior that would change by less than this share stays as it is."""
+_SCALE_RESTS = 0.05
+"""Scales of the prior of which none would change by more than this share are at rest: they are not known any better."""
+_TOLD_HOLDS = 0.02
+"""What observations tell of the drift is found anew where any scale has changed by more than this share since."""
 _WHITE_RESTS = 0.03
 """A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
 _LASTING_RESTS = 0.1
@@ -102,6 +106,8 @@ class Bundle(nn.Module):
     """By journey, how far the noise of positions and of rotations from frame to frame is from that of `prior`."""
     drift_told: Tensor
     """By journey and number of a pose, the share of the drift's changes that observations tell."""
+    told_at: Tensor
+    """The scales by which that was found; NaN before."""
 
     def __init__(
         self, unknowns: Unknowns, observations: Observations, priors: Priors, config: AdjustConfig
@@ -133,6 +139,7 @@ class Bundle(nn.Module):
         )
         self.register_buffer("white_scale", torch.ones_like(values["bias"][:, :2]))
         self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
+        self.register_buffer("told_at", torch.full_like(self._scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points
         self.lenses = observations.lenses
@@ -152,7 +159,7 @@ class Bundle(nn.Module):
             for rows, heights in ((self.corners, 0), (self.lane_points, 1))
         )
         self._by_mount = self.fleet.by_mount(values["pose"])
-        self._detections = (self.corners.detection, corner_detections(self.corners))
+        self._detections = KeptDetections()
         self._plan = self._elimination()
 
     @torch.no_grad()
@@ -225,7 +232,7 @@ class Bundle(nn.Module):
         told from zero on once they are at rest: before that it is the drift. Those of the poses' prior follow the drift and
         the noise about it, as far as there is `evidence` of them.
         """
-        values = self.values()
+        values, made_with = self.values(), self._scales()
         if len(self.lane_points):
             pose = values["pose"][self.lane_points.frame]
             found = follow(self.matches, self.lane_points, pose, values["lane"], self.lane_count)
@@ -234,14 +241,32 @@ class Bundle(nn.Module):
         self.relinearise()
         at_rest = self._narrow(values)
         if evidence is not None:
+            if evidence.told is not self.drift_told:
+                self.told_at.copy_(made_with)
             self.drift_told.copy_(evidence.told)
             at_rest &= self._rescale_noise(values, evidence)
         rescaled = self.prior.rescaled(values["drift"], self.prior_scale, self.drift_told)
-        moved = (rescaled / self.prior_scale).log().abs() > _SCALE_RESTS
-        # Within that they stay as they are, to the last digit: the cost is to fall from step to step.
-        self.prior_scale.copy_(torch.where(moved, rescaled, self.prior_scale))
+        moved = (rescaled / self.prior_scale).log().abs()
+        # To the last digit: the cost is to fall from step to step.
+        self.prior_scale.copy_(torch.where(moved > _SCALE_STAYS, rescaled, self.prior_scale))
         self.refreshed.fill_(True)
-        return at_rest and not bool(moved.any())
+        return at_rest and not bool((moved > _SCALE_RESTS).any())
+
+    def told(self) -> Float[Tensor, "j k"] | None:
+        """`drift_told`, as long as the scales are what it was found by; None: it is to be found anew."""
+        holds = torch.isclose(self._scales(), self.told_at, rtol=_TOLD_HOLDS, atol=0)
+        return self.drift_told if bool(holds.all()) else None
+
+    def _scales(self) -> Float[Tensor, " s"]:
+        """All scales that weigh observations and the prior."""
+        corner = (self.scale[0].square() + self.lasting).sqrt()
+        parts = (
+            self.prior_scale.flatten(),
+            self.white_scale.flatten(),
+            self.scale[1:],
+            corner[None],
+        )
+        return torch.cat(parts)
 
     def _rescale_noise(self, values: dict[str, Tensor], evidence: PoseEvidence) -> bool:
         """Finds the noise of poses from frame to frame; returns whether it has come to rest."""
@@ -271,7 +296,7 @@ class Bundle(nn.Module):
             by_corner = self.fleet.by_optics(rows, self.lenses, seen, values["pose"])
         rows = self.lane_points
         if len(rows):
-            coefficient, weight = self._windows()
+            coefficient, weight = self.matches.windows(self.lane_count)
             point = (weight[..., None] * values["lane"][coefficient]).sum(1)
             seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
             self.lane_points = relinearised(rows, self.lenses, self._lane_points_by_lens, seen)
@@ -321,8 +346,8 @@ class Bundle(nn.Module):
         if not len(of_corners) or self.config.method == "paper2017":
             return True
         sigma, counted = self.corner_sigma(), ~self.given_up[self.corners.detection]
-        seen = lasting_variance(self._corner_detections(), of_corners, sigma, counted)
-        white = self.scale[0].square() / self._corner_detections().most
+        seen = lasting_variance(self._detections.of(self.corners), of_corners, sigma, counted)
+        white = self.scale[0].square() / self._detections.of(self.corners).most
         rests = (seen - self.lasting).abs() <= _LASTING_RESTS * (seen + white)
         self.lasting.copy_(torch.where(rests, self.lasting, seen))
         return bool(rests)
@@ -390,15 +415,9 @@ class Bundle(nn.Module):
         )
         if isinstance(sigma, Tensor) and bool(self.lasting > 0):
             term = replace(
-                term, shared=shared_errors(self._corner_detections(), sigma, self.lasting)
+                term, shared=shared_errors(self._detections.of(self.corners), sigma, self.lasting)
             )
         return {"sign_reprojection": self.fleet.of_corners(term, rows, self._by_optics[0])}
-
-    def _corner_detections(self) -> CornerDetections:
-        """The detections of the corners, told apart anew where the corners are others."""
-        if self._detections[0] is not self.corners.detection:
-            self._detections = (self.corners.detection, corner_detections(self.corners))
-        return self._detections[1]
 
     def _loss_of_detections(self) -> JointTukey:
         """The loss of whole detections, those that are given up of no account."""
@@ -418,32 +437,5 @@ class Bundle(nn.Module):
         rows = self.lane_points
         if not len(rows):
             return {}
-        coefficient, weight = self._windows()
-        lane_slots = (("lane", column.contiguous()) for column in coefficient.unbind(1))
-        slots, valid = (("pose", rows.frame), *lane_slots), self.matches.valid.to(weight)
-        image = CostTerm(
-            lane.lane_reprojection,
-            slots,
-            (weight, self.matches.normal_px, rows.matrix),
-            valid / sigma,
-            Tukey(self.config.tukey_c),
-            lane.lane_reprojection_jacobian,
-        )
-        height = CostTerm(
-            lane.lane_height,
-            slots,
-            (weight, rows.normal_camera, rows.camera_height),
-            valid / rows.height_sigma,
-            Tukey(self.config.tukey_c),
-            lane.lane_height_jacobian,
-        )
-        terms = {"lane_reprojection": image, "lane_height": height}
+        terms = lane_point_terms(rows, self.matches, self.lane_count, sigma, self.config.tukey_c)
         return self.fleet.of_lane_points(terms, rows, self.matches.normal_px, self._by_optics[1])
-
-    def _windows(self) -> tuple[Int[Tensor, "m 4"], Float[Tensor, "m 4"]]:
-        """The four coefficients of the spline point that each lane point is held against, and their weights."""
-        count, of = self.lane_count, self.matches.lane
-        coefficient, weight, _ = spline_basis.window_flat(
-            self.matches.t.clamp_min(0), spline_basis.starts(count)[of], count[of]
-        )
-        return coefficient, weight

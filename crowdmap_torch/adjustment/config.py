@@ -37,7 +37,7 @@ class AdjustConfig(Settings):
     say. `paper2017`: eq:ba with Tukey's weights of every corner and lane point by itself, all pixels weighed alike."""
     lm: lm.LmConfig = field(
         default_factory=lambda: lm.LmConfig(
-            max_iterations=30, cost_tolerance=2e-5, initial_damping=1e-9, max_stretch=3.0
+            max_iterations=30, cost_tolerance=5e-5, initial_damping=1e-9, max_stretch=3.0
         )
     )
     """The solver; its tolerance counts once the scales stand still."""

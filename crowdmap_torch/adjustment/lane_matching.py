@@ -36,6 +36,12 @@ class LaneMatches(Rows):
     valid: Bool[Tensor, " m"]
     """False where the closest point is beyond the spline's end or behind the camera; `follow` looks at what was."""
 
+    def windows(self, count: Int[Tensor, " n"]) -> tuple[Int[Tensor, "m 4"], Float[Tensor, "m 4"]]:
+        """The four coefficients that make up each one's point, and their weights, of splines with `count` each."""
+        start, own = spline_basis.starts(count)[self.lane], count[self.lane]
+        coefficient, weight, _ = spline_basis.window_flat(self.t.clamp_min(0), start, own)
+        return coefficient, weight
+
 
 def nearest_lanes(
     point_world: Float[Tensor, "m 3"],
@@ -158,7 +164,8 @@ def _projected(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 2"], Float[Tensor, "m 2"]]:
     """Spline points in the observations' frames, their pixel errors, and how these move with the parameter."""
     rows, weight, d_weight = spline_basis.window_flat(t, start, count)
-    at, along = ((w[..., None] * coefficient[rows]).sum(-2) for w in (weight, d_weight))
+    beside = coefficient[rows]
+    at, along = ((w[:, None] @ beside)[:, 0] for w in (weight, d_weight))
     y = (matrix @ (at - position)[..., None])[..., 0]
     dy = (matrix @ along[..., None])[..., 0]
     depth = y[:, 2:].clamp_min(MIN_DEPTH)

@@ -45,6 +45,20 @@ class CornerDetections:
         return group_sum(residual, self.run, len(self.count)) / self.count[:, None]
 
 
+class KeptDetections:
+    """The detections of corner rows, told apart anew where the rows are others."""
+
+    def __init__(self) -> None:
+        self._rows: Int[Tensor, " m"] | None = None
+        self._found: CornerDetections | None = None
+
+    def of(self, rows: CornerObservations) -> CornerDetections:
+        """Those of `rows`."""
+        if self._found is None or self._rows is not rows.detection:
+            self._rows, self._found = rows.detection, corner_detections(rows)
+        return self._found
+
+
 def corner_detections(rows: CornerObservations) -> CornerDetections:
     """Those of corner rows, of which those of a detection are adjacent."""
     _, run, count = torch.unique_consecutive(

@@ -37,9 +37,24 @@ class PoseEvidence:
 
 
 def pose_evidence(
-    prior: PosePrior, equations: MapEquations, scale: Float[Tensor, "j _"]
+    prior: PosePrior,
+    equations: MapEquations,
+    scale: Float[Tensor, "j _"],
+    told: Float[Tensor, "j k"] | None = None,
 ) -> PoseEvidence:
-    """That at the point of normal equations, which have been solved, with the prior's scales that they were made with."""
+    """That at the point of normal equations, which have been solved, with the prior's scales that they were made with.
+
+    What is `told` of changes is kept where it is known already.
+    """
+    if told is None:
+        told = share_of_changes_told(prior, equations, scale)
+    return PoseEvidence(told, equations.variance_of_leaves())
+
+
+def share_of_changes_told(
+    prior: PosePrior, equations: MapEquations, scale: Float[Tensor, "j _"]
+) -> Float[Tensor, "j k"]:
+    """By journey and number, the share of the changes of its drift, and of its wander, that observations tell."""
     told = prior.bias_sigma.new_ones(len(scale), prior.numbers)
     changes = sampled_changes(prior, prior.far, prior.about_bias(_numbers(prior)))
     if len(changes.pair):
@@ -47,7 +62,7 @@ def pose_evidence(
     if prior.wander is not None:
         changes = sampled_changes(prior, prior.wander.far, _numbers(prior)[:, 6:])
         told[:, 6:] = _wander_told(prior, changes, equations.variance_of_changes(changes), scale)
-    return PoseEvidence(told, equations.variance_of_leaves())
+    return told
 
 
 def _numbers(prior: PosePrior) -> Float[Tensor, "k k"]:

@@ -241,15 +241,16 @@ class ChainNormalEquations:
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
         """Variances of the changes between blocks of chains, by the last factors: leaves marginalised, all else known."""
-        like, of = self.eliminated_gradient, changes.of
-        k, m = self.eliminated_gradient.shape[1], of.shape[1]
-        first, second = changes.pair.add(self.structure.plan.leaf_count).T
-        right_side = like.new_zeros(len(like), k, changes.columns, m)
-        right_side[first, :, changes.column] = -of
-        right_side[second, :, changes.column] = of
-        found = self.solve_eliminated(right_side.flatten(2)).view(right_side.shape)
-        change = found[second, :, changes.column] - found[first, :, changes.column]
-        return (of * change).sum(1)
+        of, variance = changes.of, self.gradient.new_empty(len(changes.pair), changes.of.shape[1])
+        for column in range(changes.columns):
+            # One at a time: all of them are several times as large as what is solved.
+            here = torch.nonzero(changes.column == column)[:, 0]
+            first, second = changes.pair[here].T
+            right_side = of.new_zeros(len(self.structure.plan.chain), *of.shape)
+            right_side[first], right_side[second] = -of, of
+            found = self.solve_chains(right_side)
+            variance[here] = (of * (found[second] - found[first])).sum(1)
+        return variance
 
     def factorise(
         self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"]
@@ -310,22 +311,40 @@ class ChainNormalEquations:
 
         Chains do not touch each other in A: one column serves as many right-hand sides as there are chains.
         """
-        structure, factor = self.structure, self.workspace.factor
+        place = self.structure.place
+        rest = right_side.new_zeros(len(self.structure.order), *right_side.shape[1:])
+        rest[place] = right_side
+        return self._solve_rounds(rest, 0)[place]
+
+    def solve_chains(self, right_side: Float[Tensor, "n k c"]) -> Float[Tensor, "n k c"]:
+        """The same of the chains' blocks alone, the leaves marginalised."""
+        structure = self.structure
+        # Leaves are the first round, if there are any.
+        begun = int(structure.plan.leaf_count > 0)
+        gone = structure.rounds[0].place.stop if begun else 0
+        place = structure.place[structure.plan.leaf_count :] - gone
+        rest = right_side.new_zeros(len(structure.order) - gone, *right_side.shape[1:])
+        rest[place] = right_side
+        return self._solve_rounds(rest, begun)[place]
+
+    def _solve_rounds(self, rest: Float[Tensor, "p k c"], begun: int) -> Float[Tensor, "p k c"]:
+        """Forth and back through the rounds from number `begun` on; what is handed in is changed."""
+        factor = self.workspace.factor
         assert factor is not None
-        rest = right_side.new_zeros(len(structure.order), *right_side.shape[1:])
-        rest[structure.place] = right_side
-        solution = torch.zeros_like(rest)
-        steps = list(zip(structure.rounds, factor.leads, strict=True))
+        steps = list(zip(self.structure.rounds, factor.leads, strict=True))[begun:]
+        gone = len(self.structure.order) - len(rest)
         for of_round, lead in steps:
-            whitened = lead.whiten @ rest[of_round.place]
-            rest[of_round.place] = whitened
-            fill = (lead.towards.mT @ whitened).view(-1, *right_side.shape[1:])
-            rest.index_add_(0, of_round.neighbour.flatten(), fill)
+            own = slice(of_round.place.start - gone, of_round.place.stop - gone)
+            whitened = lead.whiten @ rest[own]
+            rest[own] = whitened
+            fill = (lead.towards.mT @ whitened).view(-1, *rest.shape[1:])
+            rest.index_add_(0, of_round.neighbour.flatten() - gone, fill)
+        solution = torch.zeros_like(rest)
         for of_round, lead in reversed(steps):
-            beside = solution[of_round.neighbour].flatten(1, 2)
-            own = rest[of_round.place] + lead.towards @ beside
-            solution[of_round.place] = lead.whiten.mT @ own
-        return solution[structure.place]
+            own = slice(of_round.place.start - gone, of_round.place.stop - gone)
+            beside = solution[of_round.neighbour - gone].flatten(1, 2)
+            solution[own] = lead.whiten.mT @ (rest[own] + lead.towards @ beside)
+        return solution
 
     def couple(
         self, x: Float[Tensor, "e k c"], column: Int[Tensor, " e"], columns: int

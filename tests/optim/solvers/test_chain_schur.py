@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.linearize import rows
@@ -304,29 +307,10 @@ def test_the_order_is_kept_while_rows_go_no_further_than_there_is_room(by: int, 
     assert all(torch.equal(back.delta[name], first.delta[name]) for name in values)
 
 
-def test_changes_along_chains_vary_as_the_dense_inverse_says():
-    built, values, chain = problem([12, 7])
-    normal = ChainBackend(EliminationPlan("pose", chain)).assemble(built, values)
-    tiny = torch.tensor([1e-12], dtype=torch.float64)
-    normal.solve(tiny)
-    pair, column = torch.tensor([[0, 5], [12, 15], [5, 11]]), torch.tensor([0, 0, 1])
-    # The numbers of a block, and the first less the last.
-    of = torch.cat((torch.eye(3), torch.tensor([[1.0], [0.0], [-1.0]])), dim=1).double()
-    changes = ChainChanges(pair, column, of)
-    found = normal.variance_of_changes(changes)
-    dense = DenseBackend().assemble(built, values)
-    H, where = dense.hessian[0], dense.where
-    at = where.offset["pose"][:, None] + torch.arange(3)
-    # The landmarks known: their rows and columns struck out.
-    P = torch.linalg.inv(H[at.flatten()[:, None], at.flatten()]).view(len(chain), 3, len(chain), 3)
-    for k, (a, b) in enumerate(changes.pair.tolist()):
-        change = P[a, :, a] + P[b, :, b] - P[a, :, b] - P[b, :, a]
-        expected = (of.T @ change @ of).diagonal()
-        torch.testing.assert_close(found[k], expected, rtol=1e-6, atol=0)
-
-
-def test_leaves_vary_about_what_carries_them_as_the_dense_inverse_says():
-    built, values, chain = problem([12, 7])
+def on_drift(
+    built: Problem, values: Mapping[str, Tensor], chain: Tensor
+) -> tuple[Problem, dict[str, Tensor]]:
+    """The same poses, each a leaf that hangs on a drift of its own; the drifts are the chains."""
     n, every = len(chain), torch.arange(len(chain))
     weight = torch.full((n,), 9.0).double()
     bound = CostTerm(difference, (("pose", every), ("drift", every)), (), weight)
@@ -338,14 +322,47 @@ def test_leaves_vary_about_what_carries_them_as_the_dense_inverse_says():
     built = Problem(
         {**built.variables, "drift": Variable(3, euclidean)}, {**terms, "drift": prior_of_drift}
     )
-    values = {**values, "drift": torch.zeros(n, 3).double()}
-    plan = EliminationPlan("drift", chain, "pose", every)
-    found = ChainBackend(plan).assemble(built, values).variance_of_leaves()
+    return built, {**values, "drift": torch.zeros(n, 3).double()}
+
+
+def covariance_of(
+    built: Problem, values: Mapping[str, Tensor], *names: str
+) -> Float[Tensor, "n n"]:
+    """Of all numbers of these variables, all others known: their rows and columns struck out."""
     dense = DenseBackend().assemble(built, values)
-    at = torch.cat(
-        [dense.where.offset[name][:, None] + torch.arange(3) for name in ("pose", "drift")]
-    ).flatten()
-    P = torch.linalg.inv(dense.hessian[0][at[:, None], at])
+    at = torch.cat([dense.where.offset[name][:, None] + torch.arange(3) for name in names])
+    return torch.linalg.inv(dense.hessian[0][at.flatten()[:, None], at.flatten()])
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+def test_changes_along_chains_vary_as_the_dense_inverse_says(leaves: bool):
+    built, values, chain = problem([12, 7])
+    plan, eliminated = EliminationPlan("pose", chain), ("pose",)
+    if leaves:
+        built, values = on_drift(built, values, chain)
+        every = torch.arange(len(chain))
+        plan, eliminated = EliminationPlan("drift", chain, "pose", every), ("drift", "pose")
+    normal = ChainBackend(plan).assemble(built, values)
+    normal.solve(torch.tensor([1e-12], dtype=torch.float64))
+    pair, column = torch.tensor([[0, 5], [12, 15], [5, 11]]), torch.tensor([0, 0, 1])
+    # The numbers of a block, and the first less the last.
+    of = torch.cat((torch.eye(3), torch.tensor([[1.0], [0.0], [-1.0]])), dim=1).double()
+    found = normal.variance_of_changes(ChainChanges(pair, column, of))
+    n = len(chain)
+    P = covariance_of(built, values, *eliminated)[: 3 * n, : 3 * n].view(n, 3, n, 3)
+    for k, (a, b) in enumerate(pair.tolist()):
+        change = P[a, :, a] + P[b, :, b] - P[a, :, b] - P[b, :, a]
+        expected = (of.T @ change @ of).diagonal()
+        torch.testing.assert_close(found[k], expected, rtol=1e-6, atol=0)
+
+
+def test_leaves_vary_about_what_carries_them_as_the_dense_inverse_says():
+    built, values, chain = problem([12, 7])
+    n = len(chain)
+    built, values = on_drift(built, values, chain)
+    plan = EliminationPlan("drift", chain, "pose", torch.arange(n))
+    found = ChainBackend(plan).assemble(built, values).variance_of_leaves()
     less = torch.cat((torch.eye(3 * n), -torch.eye(3 * n)), dim=1).double()
+    P = covariance_of(built, values, "pose", "drift")
     expected = (less @ P @ less.T).diagonal().view(n, 3)
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-12)
