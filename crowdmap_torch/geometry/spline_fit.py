@@ -92,21 +92,32 @@ def principal_parameter(
     The axis points towards increasing first coordinate, or second, or third where those before
     vanish.
     """
-    n, k = len(count), points.shape[-1]
-    number = torch.bincount(spline, minlength=n).clamp_min(1).to(points)
-    mean = points.new_zeros(n, k).index_add(0, spline, points) / number[:, None]
-    centred = points - mean[spline]
-    outer = centred[:, :, None] * centred[:, None, :]
-    scatter = points.new_zeros(n, k, k).index_add(0, spline, outer)
-    axis = torch.linalg.eigh(scatter)[1][..., -1]
-    # eigenvectors are free in sign
-    leading = (axis.abs() > 1e-6).to(torch.uint8).argmax(-1, keepdim=True)
-    axis = axis * torch.where(axis.gather(-1, leading) < 0, -1.0, 1.0)
-    along = (centred * axis[spline]).sum(-1)
+    n = len(count)
+    along = along_principal_axis(points, spline, n)
     low = _reduce(along, spline, n, "amin")[spline]
     high = _reduce(along, spline, n, "amax")[spline]
     length = torch.where(high > low, high - low, 1.0)
     return (along - low) / length * (count[spline] - 1)
+
+
+def along_principal_axis(
+    points: Float[Tensor, "m k"], group: Int[Tensor, " m"], n: int
+) -> Float[Tensor, " m"]:
+    """How far points are along the principal axis of their group, from its mean, in the points' unit.
+
+    The axis points as in `principal_parameter`.
+    """
+    k = points.shape[-1]
+    number = torch.bincount(group, minlength=n).clamp_min(1).to(points)
+    mean = points.new_zeros(n, k).index_add(0, group, points) / number[:, None]
+    centred = points - mean[group]
+    outer = centred[:, :, None] * centred[:, None, :]
+    scatter = points.new_zeros(n, k, k).index_add(0, group, outer)
+    axis = torch.linalg.eigh(scatter)[1][..., -1]
+    # eigenvectors are free in sign
+    leading = (axis.abs() > 1e-6).to(torch.uint8).argmax(-1, keepdim=True)
+    axis = axis * torch.where(axis.gather(-1, leading) < 0, -1.0, 1.0)
+    return (centred * axis[group]).sum(-1)
 
 
 def bending(

@@ -8,9 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import group_range, group_sum
+from crowdmap_torch.clustering.groups import distinct_pairs, group_range, group_sum
 from crowdmap_torch.geometry import spline_basis, spline_fit
 from crowdmap_torch.optim.robust import Tukey
+
+_CELL_M = 2.0
+"""Places that a marker was seen from are counted over stretches of this length [m]."""
+_VIEW_M = 0.5
+"""Places nearer to each other are one [m]."""
 
 
 @dataclass(frozen=True)
@@ -68,22 +73,59 @@ def runs_of(
     return torch.empty_like(order).index_put((order,), new.cumsum(0) - 1)
 
 
-def cut_by_length(
+def runs_in_plane(
     marker: Int[Tensor, " p"],
     along: Float[Tensor, " p"],
-    *,
+    point: Float[Tensor, "p 2"],
     max_gap: float,
+) -> Int[Tensor, " p"]:
+    """Points of one marker numbered by runs without a longer gap [m] along the car's way, nor along their own axis.
+
+    Where a car turns at a crossing its way runs across the markers of the arm ahead: along it the crossing is short.
+    """
+    run = runs_of(marker, along, max_gap)
+    if not len(run):
+        return run
+    return runs_of(run, spline_fit.along_principal_axis(point, run, int(run.max()) + 1), max_gap)
+
+
+def well_seen(
+    marker: Int[Tensor, " p"],
+    along: Float[Tensor, " p"],
+    seen_from: Float[Tensor, " p"],
+    share: float,
+) -> Bool[Tensor, " p"]:
+    """Which points lie where their marker was seen from at least `share` of as many places as at its usual point.
+
+    A detection that strays may run on for as far as it is long; it does so alone. `seen_from` is where on its way the
+    car was [m]: one that stands sees much, from one place.
+    """
+    if not len(marker):
+        return torch.zeros_like(marker, dtype=torch.bool)
+    cell, view = (along / _CELL_M).floor().long(), (seen_from / _VIEW_M).floor().long()
+    cell, view = cell - cell.min(), view - view.min()
+    place = marker * (int(cell.max()) + 1) + cell
+    at, _, _ = distinct_pairs(place, view)
+    count = torch.bincount(at, minlength=int(place.max()) + 1)[place]
+    usual = _group_median(count.to(along), marker, int(marker.max()) + 1)[marker]
+    return count >= share * usual
+
+
+def cut_by_length(
+    marker: Int[Tensor, " p"],
+    run: Int[Tensor, " p"],
+    along: Float[Tensor, " p"],
+    *,
     length: float,
     overlap: float,
     control_points: int,
 ) -> LanePieces:
-    """Pieces of equal length [m], a share `overlap` of it in common with the next one, for each run of points.
+    """Pieces of equal length [m], a share `overlap` of it in common with the next one, for each run of a marker's points.
 
     A run shorter than a piece is one piece, with fewer control points at the same spacing.
     """
     if not len(marker):
         return _no_pieces(marker, along)
-    run = runs_of(marker, along, max_gap)
     runs = int(run.max()) + 1
     low, high = group_range(along, run, runs)
     extent = high - low

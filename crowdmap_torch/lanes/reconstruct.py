@@ -23,6 +23,8 @@ from crowdmap_torch.lanes.pieces import (
     cut_by_length,
     cut_by_number,
     fit_pieces,
+    runs_in_plane,
+    well_seen,
 )
 from crowdmap_torch.ranges import (
     FILLED,
@@ -32,6 +34,7 @@ from crowdmap_torch.ranges import (
     Pixels,
     Range,
     Settings,
+    Share,
     Sigma,
     Spacing,
     Span,
@@ -90,6 +93,8 @@ class LaneConfig(Settings):
     """1-sigma of the camera height, as a share of it: offsets are off by the same share."""
     min_frames: Count = 4
     """Tracklets with fewer detections are pruned; method `surface`, as all that follows."""
+    min_seen: Share = 0.15
+    """Stretches of a marker seen from a smaller share of as many places as its usual one are left out."""
     min_length_m: Length = 4.0
     """Pieces that are shorter are pruned."""
     min_points: Count = 12
@@ -178,6 +183,11 @@ def reconstruct_lanes(
     if is_paper:
         pieces, fit = _papers_pieces(ground, frame, marker, config.paper)
     else:
+        kept = well_seen(
+            marker, _along(ground, marker), ground.station - ground.depth, config.min_seen
+        )
+        ground, detection = ground[kept], detection[kept]
+        frame, marker = frame[kept], marker[kept]
         pieces, fit = _pieces(journey, ground, frame, marker, road, config)
     sigma = _control_sigma(ground, pieces, fit, config)
     if is_paper:
@@ -221,10 +231,11 @@ def _pieces(
     config: LaneConfig,
 ) -> tuple[LanePieces, LaneFit]:
     """Splines through pieces of equal length, points weighed by their noise, outliers left out."""
+    along = _along(ground, marker)
     pieces = cut_by_length(
         marker,
-        _along(ground, marker),
-        max_gap=config.max_gap_m,
+        runs_in_plane(marker, along, ground.point_world[:, :2], config.max_gap_m),
+        along,
         length=config.piece_m,
         overlap=config.overlap,
         control_points=config.control_points,

@@ -1,9 +1,19 @@
 from __future__ import annotations
 
+import math
+
+import pytest
 import torch
 
 from crowdmap_torch.geometry import spline_fit
-from crowdmap_torch.lanes.pieces import cut_by_length, cut_by_number, fit_pieces, runs_of
+from crowdmap_torch.lanes.pieces import (
+    cut_by_length,
+    cut_by_number,
+    fit_pieces,
+    runs_in_plane,
+    runs_of,
+    well_seen,
+)
 
 F64 = torch.float64
 PLAIN = {"smoothing": 0.0, "scales": (4.0, 1.0)}
@@ -19,10 +29,45 @@ def test_runs_end_at_gaps_and_at_markers() -> None:
     assert len({int(run[0]), int(run[1]), int(run[4])}) == 3
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.7, 2.0])
+def test_a_gap_is_as_long_as_on_the_road_where_the_car_turns(turn: float) -> None:
+    """Of a crossing of twenty metres only eight lie along the way of a car that turns into it."""
+    x = torch.cat((torch.arange(0, 20, 0.5), torch.arange(40, 60, 0.5))).double()
+    along = torch.where(x < 20, x, 20 + 0.4 * (x - 20))
+    marker = torch.zeros(len(x), dtype=torch.int64)
+    beside = 0.1 * (7 * x).sin()
+    way, left = (torch.tensor([math.cos(a), math.sin(a)]) for a in (turn, turn + math.pi / 2))
+    point = x[:, None] * way.double() + beside[:, None] * left.double()
+    assert int(runs_of(marker, along, 12.0).max()) == 0
+    run = runs_in_plane(marker, along, point, 12.0)
+    assert len(run[x < 20].unique()) == len(run[x > 20].unique()) == 1
+    assert len(run.unique()) == 2
+    # A gap of dashes that is shorter stays bridged.
+    dashed = torch.where(x < 20, x, x - 11)[:, None] * way.double()
+    assert int(runs_in_plane(marker, along, dashed, 12.0).max()) == 0
+
+
+def test_what_one_detection_of_many_shows_is_not_well_seen() -> None:
+    own = torch.arange(0, 40, 2.0).double()
+    stray = torch.arange(30, 70, 2.0).double()
+    along = torch.cat((own.repeat(20), stray, stray))
+    detection = torch.cat(
+        (torch.arange(20).repeat_interleave(len(own)), torch.tensor([20, 21]).repeat_interleave(20))
+    )
+    # The second marker is seen by one detection throughout: there is no other place to compare with.
+    marker = (detection == 21).long()
+    driven = well_seen(marker, along, detection.double(), 0.15)
+    assert torch.equal(driven, (marker == 1) | (along < 40))
+    # From a car that stands all of them are one view, as good as any.
+    assert bool(well_seen(marker, along, torch.full_like(along, 3.3), 0.15).all())
+
+
 def test_pieces_have_one_length_cover_all_and_overlap(generator: torch.Generator) -> None:
     along = 130 * torch.rand(2000, dtype=F64, generator=generator)
     marker = torch.zeros(2000, dtype=torch.int64)
-    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    pieces = cut_by_length(
+        marker, runs_of(marker, along, 15.0), along, length=40, overlap=0.5, control_points=6
+    )
     assert len(set(pieces.point.tolist())) == 2000
     for k in range(len(pieces)):
         own = along[pieces.point[pieces.piece == k]]
@@ -36,7 +81,9 @@ def test_pieces_have_one_length_cover_all_and_overlap(generator: torch.Generator
 def test_short_runs_get_fewer_control_points() -> None:
     along = torch.linspace(0, 17, 50, dtype=F64)
     marker = torch.zeros(50, dtype=torch.int64)
-    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    pieces = cut_by_length(
+        marker, runs_of(marker, along, 15.0), along, length=40, overlap=0.5, control_points=6
+    )
     assert pieces.control_count.tolist() == [3]
     assert len(pieces.piece) == 50
 
@@ -58,7 +105,9 @@ def test_fit_agrees_with_the_spline_of_geometry(generator: torch.Generator) -> N
     noise = 0.01 * torch.randn(400, dtype=F64, generator=generator)
     point = torch.stack((along, 3 * torch.sin(along / 15) + noise, along / 20), dim=-1)
     marker = torch.zeros(400, dtype=torch.int64)
-    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    pieces = cut_by_length(
+        marker, runs_of(marker, along, 15.0), along, length=40, overlap=0.5, control_points=6
+    )
     fit = fit_pieces(pieces, point, torch.full((400,), 1.0, dtype=F64), smoothing=0.0, scales=())
     expected = spline_fit.fit_flat(
         point[pieces.point], pieces.piece, pieces.t, pieces.control_count
@@ -70,7 +119,9 @@ def test_dear_bending_makes_pieces_straight(generator: torch.Generator) -> None:
     along = 40 * torch.rand(100, dtype=F64, generator=generator)
     point = torch.stack((along, 3 * torch.sin(along / 5), along / 20), dim=-1)
     marker, sigma = torch.zeros(100, dtype=torch.int64), torch.ones(100, dtype=F64)
-    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    pieces = cut_by_length(
+        marker, runs_of(marker, along, 15.0), along, length=40, overlap=0.5, control_points=6
+    )
     fit = fit_pieces(pieces, point, sigma, smoothing=1e6, scales=())
     assert len(pieces) == 1
     assert fit.control.diff(n=2, dim=0).abs().max() < 1e-5
@@ -82,7 +133,9 @@ def test_outliers_do_not_move_a_fit(generator: torch.Generator) -> None:
     lateral[::8] += 3.5
     point = torch.stack((along, lateral, torch.zeros_like(along)), dim=-1)
     marker = torch.zeros(200, dtype=torch.int64)
-    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    pieces = cut_by_length(
+        marker, runs_of(marker, along, 15.0), along, length=40, overlap=0.5, control_points=6
+    )
     fit = fit_pieces(
         pieces,
         point,
@@ -100,7 +153,9 @@ def test_sigma_is_the_scatter_of_fits(generator: torch.Generator) -> None:
     marker = torch.arange(trials).repeat_interleave(120)
     lateral = 0.1 * torch.randn(len(along), dtype=F64, generator=generator)
     point = torch.stack((along, lateral, torch.zeros_like(along)), dim=-1)
-    pieces = cut_by_length(marker, along, max_gap=15, length=40, overlap=0.5, control_points=6)
+    pieces = cut_by_length(
+        marker, runs_of(marker, along, 15.0), along, length=40, overlap=0.5, control_points=6
+    )
     # The noise is not what was expected, and is found out.
     fit = fit_pieces(pieces, point, torch.full_like(along, 0.05), **PLAIN)
     scatter = fit.control[:, 1].reshape(trials, 6).square().mean(0).sqrt()
@@ -111,7 +166,7 @@ def test_sigma_is_the_scatter_of_fits(generator: torch.Generator) -> None:
 def test_no_points_give_no_pieces() -> None:
     none, real = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=F64)
     for pieces in (
-        cut_by_length(none, real, max_gap=15, length=40, overlap=0.5, control_points=6),
+        cut_by_length(none, none, real, length=40, overlap=0.5, control_points=6),
         cut_by_number(none, none, real.reshape(0, 3), number=100, control_points=6),
     ):
         fit = fit_pieces(pieces, real.reshape(0, 3), real, **PLAIN)

@@ -196,6 +196,30 @@ def test_dashes_are_bridged_and_long_silence_is_not(
     assert bool((covered < 30).any() and (covered > 110).any())
 
 
+def test_one_detection_alone_makes_no_marker_longer(
+    suburb: SimulatedDrives, road: RoadEstimate
+) -> None:
+    truth = suburb.truths[0]
+    tracklets = lane_tracklets(truth)
+    frame = truth.journey.lanes.frame
+    seen = [frame[tracklets.label == k] for k in range(tracklets.count)]
+    longest = max(range(tracklets.count), key=lambda k: int(seen[k].max() - seen[k].min()))
+    way = truth.journey.T_world_camera[:, :3, 3]
+    station = torch.cat((way.new_zeros(1), way.diff(dim=0).norm(dim=-1).cumsum(0)))
+    seen_from = station[frame]
+    late = (tracklets.label == longest) & (seen_from > 60)
+    alone = late & (frame == frame[late & (seen_from > 75)].min())
+    label = torch.where(late & ~alone, -1, tracklets.label)
+    pieces, _ = reconstruct_lanes(
+        truth.journey, Tracklets(label, tracklets.count), road, LaneConfig()
+    )
+    own = pieces.select((pieces.tracklet == longest).nonzero()[:, 0])
+    line, _, _ = spline_length.sample_flat(own.control.point_world, own.control_count, 1.0)
+    covered = station[torch.cdist(line, way).argmin(-1)]
+    # From sixty metres the others see as far as `range_m`, 25 m ahead; the lonely one saw to a hundred.
+    assert bool(alone.any()) and 70 < float(covered.max()) < 88
+
+
 def test_short_tracklets_are_pruned_and_counted(
     suburb: SimulatedDrives, road: RoadEstimate
 ) -> None:
