@@ -18,6 +18,7 @@ from torch import Tensor
 from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.geometry.extent import extent
+from crowdmap_torch.notebook import HasFrame, HasLayers, HasPicture
 
 LANE_TYPES = ("solid", "dashed", "double", "curb")
 """Lane types by code; -1 is unknown."""
@@ -26,7 +27,7 @@ Table = TypeVar("Table", bound="Rows")
 
 
 @dataclass(frozen=True)
-class Rows:
+class Rows(HasFrame):
     """A table whose every tensor has the rows as its leading axis; None where an optional column is missing."""
 
     def __len__(self) -> int:
@@ -310,7 +311,7 @@ def concatenate_lanes(tables: Sequence[Lanes]) -> Lanes:
 
 
 @dataclass(frozen=True)
-class HdMap:
+class HdMap(HasPicture):
     """Signs and lanes in one local frame."""
 
     origin: Origin
@@ -356,7 +357,7 @@ class RejectedJourney:
 
 
 @dataclass(frozen=True)
-class Dataset:
+class Dataset(HasPicture):
     """What the mapper reads: journeys in use, and those set aside with their reasons."""
 
     origin: Origin
@@ -402,7 +403,7 @@ class SurveyLanePoints(Rows):
 
 
 @dataclass(frozen=True)
-class Survey:
+class Survey(HasLayers):
     """What a map is measured against: signs and lane markers whose place is known."""
 
     origin: Origin
@@ -415,8 +416,7 @@ class Survey:
 
     def __repr__(self) -> str:
         place = torch.cat((self.signs.center_world, self.lane_points.point_world))
-        what = f"{len(self.signs):,} signs, {len(self.lane_id):,} lane markers"
-        return f"Survey({what}, {extent(place)} at {self.origin})"
+        return f"Survey({len(self.signs):,} signs, {len(self.lane_id):,} lane markers, {extent(place)} at {self.origin})"
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "ARCHITECTURE.md"
 PACKAGE = "crowdmap_torch"
 FLOORS = (
-    ("ranges", "processes"),
+    ("ranges", "processes", "notebook"),
     ("geometry", "optim", "clustering"),
     ("tables",),
     ("residuals",),

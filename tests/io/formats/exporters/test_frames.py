@@ -75,3 +75,15 @@ def test_the_library_is_loaded_without_what_a_notebook_alone_needs():
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout == "[]\n"
+
+
+def test_tables_have_what_the_package_has(hd_map: HdMap, tiny: Dataset, tiny_survey: Survey):
+    pytest.importorskip("pandas")
+    for what in (hd_map, tiny, tiny_survey):
+        assert what.to_geojson() == to_geojson(what)
+        own, functions = what.to_pandas(), to_pandas(what)
+        assert [*own] == [*functions]
+        assert all(own[name].equals(functions[name]) for name in own)
+    assert hd_map.signs.to_pandas()["shape"].tolist() == hd_map.signs.shape.tolist()
+    for figure in (hd_map.plot(), hd_map.plot(tiny_survey), tiny.plot()):
+        assert figure.axes[0].lines or figure.axes[0].collections
