@@ -10,15 +10,20 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-FROM_ROOT = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+FROM_ROOT = {
+    "README.md": "FIRST_MAP.md",
+    "CONTRIBUTING.md": "CONTRIBUTING.md",
+    "CHANGELOG.md": "CHANGELOG.md",
+}
+"""Pages of the root by their names on the site, where a README.md would take the place of index.md."""
 
 
 def on_files(files: Any, config: Any) -> Any:
     """The files of docs/ and those of the root."""
     from mkdocs.structure.files import File  # pyright: ignore[reportMissingImports]
 
-    for name in FROM_ROOT:
-        files.append(File.generated(config, name, content=(ROOT / name).read_text("utf-8")))
+    for name, page in FROM_ROOT.items():
+        files.append(File.generated(config, page, content=(ROOT / name).read_text("utf-8")))
     return files
 
 
@@ -29,12 +34,13 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 def with_links(markdown: str, name: str, known: set[str]) -> str:
     """The text of page `name`: links between docs/ and the root lead to the `known` files, others are their text alone."""
-    folder = ROOT if name in FROM_ROOT else ROOT / "docs"
+    folder = ROOT if name in FROM_ROOT.values() else ROOT / "docs"
 
     def there(match: re.Match[str]) -> str:
         bang, text, target, anchor = match.groups(default="")
         path, own = (folder / target).resolve(), ROOT / "docs"
-        inside = path.relative_to(own).as_posix() if path.is_relative_to(own) else path.name
+        is_own = path.is_relative_to(own)
+        inside = path.relative_to(own).as_posix() if is_own else FROM_ROOT.get(path.name, path.name)
         if inside in known:
             return f"{bang}[{text}]({inside}{anchor})"
         return "" if bang else text

@@ -12,7 +12,7 @@ import site_pages
 import yaml
 
 ROOT = Path(__file__).parents[1]
-KNOWN = {"README.md", "CONTRIBUTING.md", "FORMAT.md", "map.png"}
+KNOWN = {"FIRST_MAP.md", "CONTRIBUTING.md", "FORMAT.md", "map.png"}
 
 
 def test_links_between_docs_and_the_root_lead_to_pages():
@@ -23,7 +23,7 @@ def test_links_between_docs_and_the_root_lead_to_pages():
         "[a](CONTRIBUTING.md#x) ![m](map.png) [b](FORMAT.md) [c](https://a.b/c) d"
     )
     said = "![m](docs/map.png) [b](docs/FORMAT.md#y) [l](LICENSE) [p](#part)"
-    assert site_pages.with_links(said, "README.md", KNOWN) == (
+    assert site_pages.with_links(said, "FIRST_MAP.md", KNOWN) == (
         "![m](map.png) [b](FORMAT.md#y) l [p](#part)"
     )
 
@@ -38,7 +38,7 @@ def test_every_page_is_in_the_navigation():
                 found |= {value} if isinstance(value, str) else pages(value)
         return found
 
-    there = {page.name for page in (ROOT / "docs").glob("*.md")} | {*site_pages.FROM_ROOT}
+    there = {page.name for page in (ROOT / "docs").glob("*.md")} | {*site_pages.FROM_ROOT.values()}
     assert pages(told) == there
 
 
@@ -50,6 +50,9 @@ def test_the_site_is_built_without_a_complaint(tmp_path: Path):
     call = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")]
     done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    api = (tmp_path / "site" / "API" / "index.html").read_text("utf-8")
+    site = tmp_path / "site"
+    assert 'id="where-to-go"' in (site / "index.html").read_text("utf-8")
+    assert "<title>First map" in (site / "FIRST_MAP.html").read_text("utf-8")
+    api = (site / "API.html").read_text("utf-8")
     assert "build_map" in api and "crowdmap_torch.mapper" in api
     assert "http://fonts" not in api and "https://fonts" not in api
