@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import shape_checks
 import torch
-from jaxtyping import install_import_hook
 
 if TYPE_CHECKING:
     from worlds.small_world import Builder
@@ -24,8 +24,14 @@ if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)
 
 if os.environ.get("CROWDMAP_CHECK_SHAPES"):
-    # Every jaxtyping annotation of the package is checked at run time, as in `make test`.
-    install_import_hook("crowdmap_torch", "shape_checks.checked")
+    # Jaxtyping annotations of the package are checked at run time, as in `make test`.
+    shape_checks.install("crowdmap_torch")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def annotations_are_checked_in_every_file() -> None:
+    shape_checks.begin_file()
+
 
 ROOT = Path(__file__).parent.parent
 

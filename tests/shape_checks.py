@@ -1,8 +1,68 @@
-"""The checker of annotations that `CROWDMAP_CHECK_SHAPES=1` puts on every function of the package."""
+"""The checks of annotations that `CROWDMAP_CHECK_SHAPES=1` puts on the functions of the package."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from types import FunctionType
+from typing import Any
+
+import jaxtyping
 from beartype import BeartypeConf, beartype
+
+CALLS = 50
+"""Calls of a function that are checked in each file of tests: checks of all of them take as long as the tests."""
 
 checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """Types and shapes of arguments and results; an int will do for a float, as for every type checker."""
+
+_files = 0
+"""Files of tests that were begun."""
+
+
+def begin_file() -> None:
+    """From now on the first calls of every function are checked again."""
+    global _files
+    _files += 1
+
+
+def install(package: str) -> None:
+    """Checks the functions of a package that are imported from now on, and what its dataclasses are made of.
+
+    Not those that are made within functions, which would be compiled anew at every call.
+    """
+    decorate = jaxtyping.jaxtyped
+
+    def jaxtyped(*, typechecker: Any) -> Callable[[Any], Any]:
+        outermost = decorate(typechecker=typechecker)
+
+        def decorated(made: Any) -> Any:
+            if "<locals>" in made.__qualname__:
+                return made
+            return _at_first(made, outermost) if type(made) is FunctionType else outermost(made)
+
+        return decorated
+
+    # What is imported looks the decorator up by this name.
+    setattr(jaxtyping, "jaxtyped", jaxtyped)  # noqa: B010
+    jaxtyping.install_import_hook(package, "shape_checks.checked")
+
+
+def _at_first(
+    function: Callable[..., Any], checks: Callable[[Callable[..., Any]], Callable[..., Any]]
+) -> Callable[..., Any]:
+    """A function whose first calls are checked; what checks it is made when it is called, if it ever is."""
+    file, left, with_checks = -1, 0, None
+
+    @functools.wraps(function)
+    def called(*args: Any, **options: Any) -> Any:
+        nonlocal file, left, with_checks
+        if file != _files:
+            file, left = _files, CALLS
+        if not left:
+            return function(*args, **options)
+        left -= 1
+        with_checks = with_checks or checks(function)
+        return with_checks(*args, **options)
+
+    return called
