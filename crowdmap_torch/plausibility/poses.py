@@ -47,6 +47,8 @@ class PoseLimits:
     """Median sigma of positions."""
     sigma_rad: tuple[float, float] = (1e-6, 0.5)
     """The same of rotations."""
+    least_rotations: int = 5
+    """Rotations that differ from which on it is told whether they were rounded."""
     units: UnitLimits = field(default_factory=UnitLimits)
     """How often frames come, and how fast cars are."""
 
@@ -77,6 +79,7 @@ def pose_findings(
         *_heights(journey, origin, limits),
         *_speeds(journey, limits),
         *_sigmas(journey, limits),
+        *_rounded(journey, limits),
         *_axes(journey, limits),
     ]
 
@@ -207,6 +210,33 @@ def _sigmas(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
                 "leave the columns out where they are not known",
                 repair=Repair("no-sigmas", of=name),
             )
+
+
+_ROUNDED_FRAMES = 64
+"""Frames of which it is told whether their rotations were rounded."""
+
+
+def _rounded(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
+    """Whether quaternions have two digits: all four numbers are hundredths then, but for their common length."""
+    q = se3.to_quaternion(_links(journey)[:, :3, :3])
+    q = q[:: -(-len(q) // _ROUNDED_FRAMES)]
+    if len(q.unique(dim=0)) < limits.least_rotations:
+        return
+    largest = q.abs().amax(-1, keepdim=True)
+    hundredths = torch.arange(50, 102).to(q)[:, None] * (q / largest)[:, None]
+    is_rounded = ((hundredths - hundredths.round()).abs() < 1e-6).all(-1).any(-1)
+    if float(is_rounded.double().mean()) < _MOSTLY:
+        return
+    off = math.degrees(2 * 0.005 * 3**0.5)
+    yield Finding(
+        "rounded-rotations",
+        f"quaternions are hundredths: rotations are up to {off:.1g} degrees off",
+        "they were written with two digits",
+        "write all digits; what is lost cannot be put right",
+    )
+
+
+_MOSTLY = 0.9
 
 
 def _axes(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:

@@ -14,7 +14,7 @@ from crowdmap_torch.checking.check import SPOILS, Check, Item, check_dataset
 from crowdmap_torch.checking.repair import write_repaired
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.plausibility.finding import Repair
-from crowdmap_torch.soak.mistakes import differences, is_near
+from crowdmap_torch.soak.mistakes import differences, grave, is_near
 from crowdmap_torch.soak.spoiled import MISTAKES
 from crowdmap_torch.soak.verdict import digest
 from crowdmap_torch.tables import Dataset
@@ -36,6 +36,14 @@ def test_mistakes_that_hide_one_another_are_put_right_in_rounds(
     assert len(mended.changes) == 5
     assert is_near(differences(drives, mended.check.dataset), "row-by-row")
     assert digest(bad) == before
+
+
+def test_what_rounding_has_lost_is_told_and_not_taken_for_another_mistake(
+    spoil, tmp_path: Path
+) -> None:
+    bad = spoil("rounded")
+    mended = write_repaired(bad, tmp_path / "new", check_dataset(bad))
+    assert grave(mended.check) == {"rounded-rotations"}
 
 
 def _scaled(folder: Path, factor: float) -> None:

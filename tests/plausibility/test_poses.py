@@ -86,3 +86,16 @@ def test_a_drive_to_the_east_shows_another_order_of_quaternions_only_a_little() 
     # A camera that looks as far aside for good is none.
     aside = se3.exp(torch.tensor([0, 0, 0, 0.1, 0.25, 0]).double())
     assert kinds(replace(journey, T_world_camera=T @ aside)) == []
+
+
+def test_rotations_with_two_digits_are_named_and_those_with_three_or_of_one_heading_are_not() -> (
+    None
+):
+    journey = drive(torch.linspace(0.3, 1.2, 80).double())
+    q = se3.to_quaternion(journey.T_world_camera[:, :3, :3])
+    place = journey.T_world_camera[:, :3, 3]
+    for digits, expected in ((2, ["rounded-rotations"]), (3, []), (15, [])):
+        rounded = torch.nn.functional.normalize(q.round(decimals=digits), dim=-1)
+        T = se3.make(se3.from_quaternion(rounded), place)
+        assert kinds(replace(journey, T_world_camera=T)) == expected
+    assert kinds(drive(torch.zeros(80).double())) == []
