@@ -14,6 +14,7 @@ from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.special import chdtri
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_median, group_sum
@@ -59,17 +60,22 @@ class LensLimits:
     """Distance between the knots of the drift."""
     tukey: float = 3.0
     """Views with a root mean square whitened error beyond this many standard deviations have no say."""
-    log_ratio: float = 8.0
+    log_ratio: float = 5.0
     """Least logarithm of the likelihood of undistorted pixels over that of raw ones. Raw pixels come there by chance where
-    they are four standard deviations off."""
+    they are three standard deviations off, and most of a lens."""
     most: float = 1.5
     """Largest share of the lens that may be missing, but for two standard deviations: more has another cause."""
     all_of_it: float = 0.3
     """A share this near to 1, or within three standard deviations of it, is taken for all of the lens."""
-    sure: float = 5.0
+    sure: float = 4.0
     """Standard deviations from zero of a lens that a rig does not have, ..."""
     least_k1: float = 0.02
     """... and how strong it is: pixels that were undistorted with a slightly wrong lens are no mistake."""
+    scatter: tuple[float, float] = (1.9, 32.0)
+    """Shares of simulated drives differ from the truth as if their variances were so many times larger, and with how many
+    degrees of freedom that is known."""
+    contradicting: float = 0.99
+    """Quantile of that scatter from which on drives are said to contradict each other."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +146,7 @@ def is_bare(rig: Rig) -> bool:
 def _undistorted(found: Collection[MissingLens], limits: LensLimits) -> Finding | None:
     if not found:
         return None
-    all_of_it = _together(found)
+    all_of_it = _together(found, limits)
     share, sigma = all_of_it.share, all_of_it.sigma
     if all_of_it.log_ratio < limits.log_ratio or share > limits.most + 2 * sigma:
         return None
@@ -157,7 +163,7 @@ def _undistorted(found: Collection[MissingLens], limits: LensLimits) -> Finding 
 def _without_lens(found: Collection[MissingLens], limits: LensLimits) -> Finding | None:
     if not found:
         return None
-    all_of_it = _together(found)
+    all_of_it = _together(found, limits)
     k1, sigma = _UNIT_K1 * all_of_it.share, abs(_UNIT_K1) * all_of_it.sigma
     if abs(k1) < max(limits.least_k1, limits.sure * sigma):
         return None
@@ -169,13 +175,18 @@ def _without_lens(found: Collection[MissingLens], limits: LensLimits) -> Finding
     )
 
 
-def _together(found: Collection[MissingLens]) -> MissingLens:
-    """The weighted mean; where drives contradict each other its sigma is by their spread."""
+def _together(found: Collection[MissingLens], limits: LensLimits) -> MissingLens:
+    """The weighted mean; where drives contradict each other its sigma is by their spread alone."""
     weight = [one.sigma**-2 for one in found]
     total = sum(weight)
     share = sum(one.share * w for one, w in zip(found, weight, strict=True)) / total
     misfit = sum((one.share - share) ** 2 * w for one, w in zip(found, weight, strict=True))
-    return MissingLens(share, math.sqrt(max(1.0, misfit / max(len(found) - 1, 1)) / total))
+    (usual, known), own = limits.scatter, len(found) - 1
+    if misfit > usual * float(chdtri(own, 1 - limits.contradicting)):
+        scatter = misfit / own
+    else:
+        scatter = (usual * known + misfit) / (known + own)
+    return MissingLens(share, math.sqrt(scatter / total))
 
 
 def missing_lens(

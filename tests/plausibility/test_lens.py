@@ -86,6 +86,24 @@ def test_drives_that_tell_nothing_are_passed_over(good: Path) -> None:
     assert lens_findings([], [], CONFIG.positioning) == []
 
 
+def test_drives_that_differ_as_drives_do_decide_together(
+    monkeypatch: pytest.MonkeyPatch, good: Path
+) -> None:
+    journeys = 2 * load_dataset(good).journeys
+    bare = [
+        replace(j, journey_id=str(k), rig=replace(j.rig, camera=without_lens(j.rig.camera)))
+        for k, j in enumerate(journeys)
+    ]
+    nothing = [Tracklets(torch.full_like(j.signs.frame, -1), 0) for j in bare]
+    # Of a highway and a narrow camera: nearly six of their own sigmas together, over four of what drives differ by.
+    said = iter([(0.81, 0.26), (1.06, 0.28), (1.55, 0.42), (0.43, 0.39)])
+    monkeypatch.setattr(
+        "crowdmap_torch.plausibility.lens.missing_lens", lambda *_: MissingLens(*next(said))
+    )
+    named = lens_findings(bare, nothing, CONFIG.positioning)
+    assert {finding.kind for _, finding in named} == {"no-lens"}
+
+
 @pytest.mark.parametrize("shares", [(0.0, 1.0), (1.0, -1.0)])
 def test_drives_that_contradict_each_other_do_not_decide(
     shares: tuple[float, ...], monkeypatch: pytest.MonkeyPatch, good: Path
