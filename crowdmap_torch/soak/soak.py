@@ -14,6 +14,7 @@ from crowdmap_torch.commands.subcommands import OneLineParser, add_subcommands
 STUDIES = {
     "mutants": "destroy inputs at random, and run commands on what is left",
     "kills": "kill runs at random instants, and resume them",
+    "mended": "map good data sets, the same with a mistake, and these put right",
     "mistakes": "make the usual mistakes on good data sets, and check and mend them",
     "signals": "interrupt runs at random instants, and resume them",
 }

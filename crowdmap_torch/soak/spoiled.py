@@ -16,12 +16,12 @@ import torch
 import yaml
 from scipy.spatial.transform import Rotation
 
-from crowdmap_torch.geometry.camera import distort, unproject
+from crowdmap_torch.geometry.camera import MODELS, distort, unproject
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.formats.composing.utm import convergence, grid_from_geodetic
 from crowdmap_torch.io.formats.geodesy import geodetic_from_local
 from crowdmap_torch.io.rigs import read_rig
-from crowdmap_torch.tables import Origin
+from crowdmap_torch.tables import Dataset, Origin
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,22 @@ class Mistake:
     """Words of its cause."""
     is_cured: bool = True
     """Whether `crowdmap check --fix` puts it right."""
+    leaves: str = ""
+    """Kind of the finding that is left once it was put right: of what is lost for good."""
     may_hide: bool = False
-    """True: drives that hardly turn do not show it."""
+    """True: not all drives show it (docs/OWN_DATA.md), and what does not show need not be named."""
+    of_models: tuple[str, ...] = MODELS
+    """Camera models with which it can be made."""
+    of_lens: bool = False
+    """True: it cannot be made where rigs have no distortion."""
+
+    def can_be_made(self, good: Dataset) -> bool:
+        """Whether a data set has what it takes to make the mistake in all of its rigs."""
+        cameras = [journey.rig.camera for journey in good.journeys]
+        return all(
+            c.model in self.of_models and (bool((c.distortion != 0).any()) or not self.of_lens)
+            for c in cameras
+        )
 
 
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -349,7 +363,10 @@ MISTAKES: dict[str, Mistake] = {
         "unsorted-frames", lambda folder: _each(folder, "poses", _shuffled), "not sorted"
     ),
     "rounded": Mistake(
-        "quaternion-length", lambda folder: _each(folder, "poses", _rounded), "rounded"
+        "quaternion-length",
+        lambda folder: _each(folder, "poses", _rounded),
+        "rounded",
+        leaves="rounded-rotations",
     ),
     "float32": Mistake("column-type", _single, "another type"),
     "whole-pixels": Mistake("column-type", _whole_pixels, "another type"),
@@ -367,14 +384,33 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "row-by-row": Mistake("crossed-corners", _pixels(_row_by_row, lanes=False), "row by row"),
     "boxes": Mistake("boxes", _coco, "boxes"),
-    "undistorted": Mistake("undistorted", lambda folder: _through(folder, []), "undistorted"),
-    "no-lens": Mistake("no-lens", lambda folder: _with_lens(folder, []), "raw pixels", False),
+    "undistorted": Mistake(
+        "undistorted",
+        lambda folder: _through(folder, []),
+        "undistorted",
+        may_hide=True,
+        of_lens=True,
+    ),
+    "no-lens": Mistake(
+        "no-lens",
+        lambda folder: _with_lens(folder, []),
+        "raw pixels",
+        is_cured=False,
+        may_hide=True,
+        of_models=("brown_conrady",),
+        of_lens=True,
+    ),
     "coefficients": Mistake(
-        "coefficient-order", lambda folder: _rigs(folder, _coefficients), "in another order"
+        "coefficient-order",
+        lambda folder: _rigs(folder, _coefficients),
+        "in another order",
+        may_hide=True,
+        of_models=("brown_conrady",),
+        of_lens=True,
     ),
     "frames-late": Mistake("frame-offset", _frames_off, "frame numbers"),
     "antenna": Mistake(
-        "lever-arm", _poses(lambda R, p: (R, p + R @ _ANTENNA)), "an antenna", False, True
+        "lever-arm", _poses(lambda R, p: (R, p + R @ _ANTENNA)), "an antenna", False, may_hide=True
     ),
     "normal-up": Mistake(
         "road-normal", _road("normal", lambda n: [-float(x) for x in n]), "upwards"
