@@ -89,6 +89,25 @@ def marked_map(
     )
 
 
+def crossing() -> HdMap:
+    """Four roads of 40 m that end 12 m before the middle of a crossing, one lane each way; the crossing has no markers."""
+    markers = []
+    for turn in (0.0, 90.0, 180.0, 270.0):
+        c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+
+        def along(left: float, begin: float, end: float, c: float = c, s: float = s) -> np.ndarray:
+            first, last = ((c * r - s * left, s * r + c * left) for r in (begin, end))
+            return line(first, last)
+
+        # Seen from the middle: those who leave keep to the right.
+        markers += [
+            ("solid", along(3.5, 52, 12)),
+            ("double", along(0.0, 12, 52)),
+            ("solid", along(-3.5, 12, 52)),
+        ]
+    return marked_map(markers)
+
+
 def two_way_road() -> HdMap:
     """120 m of road to the east: two lanes that way, one back; the middle line in two pieces, signs for both ways."""
     markers = [

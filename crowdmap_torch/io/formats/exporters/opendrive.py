@@ -14,10 +14,16 @@ import numpy as np
 from jaxtyping import Float
 
 from crowdmap_torch.geometry import polygon
-from crowdmap_torch.io.formats.exporters.attributes import add, add_cubics
+from crowdmap_torch.io.formats.exporters.attributes import add
 from crowdmap_torch.io.formats.exporters.carriageways import Carriageways, carriageways
 from crowdmap_torch.io.formats.exporters.features import Layer, lane_points, layers
 from crowdmap_torch.io.formats.exporters.head import head, json_text
+from crowdmap_torch.io.formats.exporters.junctions import (
+    add_connecting_roads,
+    add_junctions,
+    junction_of,
+    junctions,
+)
 from crowdmap_torch.io.formats.exporters.lane_sections import (
     LINKS,
     Ends,
@@ -26,6 +32,7 @@ from crowdmap_torch.io.formats.exporters.lane_sections import (
     neighbour,
 )
 from crowdmap_torch.io.formats.exporters.reference_line import cubics, value
+from crowdmap_torch.io.formats.exporters.road_shape import add_shape
 from crowdmap_torch.io.formats.exporters.roads import Road, roads
 from crowdmap_torch.io.formats.geodesy import FLATTENING, SEMI_MAJOR_M
 from crowdmap_torch.tables import HdMap, Origin
@@ -52,8 +59,10 @@ def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     _header(root, hd_map, points)
     feet = _feet(hd_map, every)
     ends = [lane_ends(ways, road) for road in every]
+    connections = junctions(ways, every, ends)
+    at_junction = junction_of(connections)
     for number, road in enumerate(every):
-        element = _road(root, number, road, ends)
+        element = _road(root, number, road, ends, at_junction)
         add_lanes(element, number, road, ways, lanes, ends)
         chosen = [row for row, foot in enumerate(feet) if foot and foot.road == number]
         if chosen:
@@ -62,6 +71,8 @@ def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
                 foot = feet[row]
                 assert foot is not None
                 _signal(group, row, foot, road, hd_map, signs)
+    add_connecting_roads(root, connections, len(every) + 1)
+    add_junctions(root, connections, len(every) + 1)
     ET.indent(root)
     ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     return _losses(hd_map, ways, every, feet)
@@ -136,7 +147,13 @@ def _projection(origin: Origin) -> str:
     )
 
 
-def _road(root: ET.Element, number: int, road: Road, ends: list[Ends]) -> ET.Element:
+def _road(
+    root: ET.Element,
+    number: int,
+    road: Road,
+    ends: list[Ends],
+    at_junction: dict[tuple[int, str], int],
+) -> ET.Element:
     line = road.line
     element = add(
         root,
@@ -147,31 +164,18 @@ def _road(root: ET.Element, number: int, road: Road, ends: list[Ends]) -> ET.Ele
         junction=-1,
         rule="LHT" if road.is_left_hand else "RHT",
     )
-    links = [(name, neighbour(number, which, ends)) for name, which in LINKS]
-    if any(near for _, near in links):
+    links = [
+        (name, neighbour(number, which, ends), at_junction.get((number, which)))
+        for name, which in LINKS
+    ]
+    if any(near or junction is not None for _, near, junction in links):
         link = ET.SubElement(element, "link")
-        for name, near in links:
+        for name, near, junction in links:
             if near:
                 add(link, name, elementType="road", elementId=near[0] + 1, contactPoint=near[1])
-    plan = ET.SubElement(element, "planView")
-    for k, c in enumerate(line.coefficient):
-        geometry = add(
-            plan,
-            "geometry",
-            s=line.s[k],
-            x=line.start[k, 0],
-            y=line.start[k, 1],
-            hdg=line.heading[k],
-            length=line.s[k + 1] - line.s[k],
-        )
-        powers = {
-            f"{a}{axis}": c[p, j] for j, axis in enumerate("UV") for p, a in enumerate("abcd")
-        }
-        add(geometry, "paramPoly3", **powers, pRange="arcLength")
-    profile = ET.SubElement(element, "elevationProfile")
-    add_cubics(profile, "elevation", "s", cubics(line.s, line.height, line.slope))
-    lateral = ET.SubElement(element, "lateralProfile")
-    add_cubics(lateral, "superelevation", "s", cubics(line.s, road.tilt, road.tilt_slope))
+            elif junction is not None:
+                add(link, name, elementType="junction", elementId=junction + 1)
+    add_shape(element, line, road.tilt, road.tilt_slope)
     return element
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
-from worlds.marked_roads import bend, line, marked_map, two_way_road
+from worlds.marked_roads import bend, crossing, line, marked_map, two_way_road
 from worlds.opendrive_reader import ReadRoad, facing, number
 
 from crowdmap_torch.geometry import polygon
@@ -59,7 +59,7 @@ def exported(hd_map: HdMap, folder: Path) -> list[ReadRoad]:
     write(hd_map, folder / "map.xodr")
     root = ET.parse(folder / "map.xodr").getroot()
     assert root.find("header").attrib["revMinor"] == "7"  # pyright: ignore[reportOptionalMemberAccess]
-    return [ReadRoad(road) for road in root.iter("road")]
+    return [ReadRoad(road) for road in root.iter("road") if road.attrib["junction"] == "-1"]
 
 
 def dense(points: np.ndarray) -> np.ndarray:
@@ -168,6 +168,62 @@ def test_roads_go_on_into_one_another(tmp_path: Path):
         assert joined >= 1
 
 
+def test_lanes_go_on_over_a_crossing(tmp_path: Path):
+    roads = {road.element.attrib["id"]: road for road in exported(crossing(), tmp_path)}
+    root = ET.parse(tmp_path / "map.xodr").getroot()
+    (junction,) = root.iter("junction")
+    over = [ReadRoad(road) for road in root.iter("road") if road.attrib["junction"] != "-1"]
+    # From each of four arms straight on, to the left and to the right.
+    assert len(roads) == 4 and len(over) == len(junction) == 12
+    ways = set()
+    for road, connection in zip(over, junction, strict=True):
+        assert road.element.attrib["junction"] == junction.attrib["id"]
+        assert connection.attrib["connectingRoad"] == road.element.attrib["id"]
+        ((lane_id, lane),) = [one for one in road.lanes().items() if one[0]]
+        tips = []
+        for name, s in (("predecessor", 0.0), ("successor", road.length)):
+            link, lane_link = road.element.find(f"link/{name}"), lane.find(f"link/{name}")
+            assert link is not None and lane_link is not None
+            other, its = roads[link.attrib["elementId"]], int(lane_link.attrib["id"])
+            at = {"start": 0.0, "end": other.length}[link.attrib["contactPoint"]]
+            mine, theirs = road.borders(s), other.borders(at)
+            inner = its - int(np.sign(its))
+            for own, one in ((0, inner), (lane_id, its)):
+                away = road.world(s, mine[own]) - other.world(at, theirs[one])
+                assert np.linalg.norm(away) < 5e-3
+            # Its arm says so too.
+            which = {"start": "predecessor", "end": "successor"}[link.attrib["contactPoint"]]
+            end = other.element.find(f"link/{which}")
+            assert end is not None and end.attrib["elementType"] == "junction"
+            assert end.attrib["elementId"] == junction.attrib["id"]
+            # Lanes to the right of the line run along it: into the crossing at its end, out of it at its start.
+            runs = (its < 0) == (link.attrib["contactPoint"] == "end")
+            assert runs == (name == "predecessor")
+            heading = other.line(at)[2] + (0.0 if its < 0 else np.pi)
+            assert np.cos(road.line(s)[2] - heading) > 0.9999
+            tips.append(link.attrib["elementId"])
+        (lane_link,) = connection
+        assert connection.attrib["incomingRoad"] == tips[0] and tips[0] != tips[1]
+        assert int(lane_link.attrib["to"]) == lane_id
+        ways.add(tuple(tips))
+    assert len(ways) == 12
+
+
+def test_lanes_go_on_where_none_is_marked(tmp_path: Path):
+    """Not over another road, and not up a bridge."""
+    before = [("solid", line((0, y), (40, y))) for y in (3.5, 0.0)]
+    behind = [("solid", line((75, y), (120, y))) for y in (3.5, 0.0)]
+    across = [("solid", line((x, -60), (x, 60))) for x in (55, 58.5)]
+    high = [("solid", line((75, y), (120, y), z=5.0)) for y in (3.5, 0.0)]
+    for markers, count in (
+        ([*before, *behind], 1),
+        ([*before, *behind, *across], 0),
+        ([*before, *high], 0),
+    ):
+        exported(marked_map(markers), tmp_path)
+        assert len([*ET.parse(tmp_path / "map.xodr").getroot().iter("junction")]) == count
+
+
 def test_what_is_left_out_is_said(tmp_path: Path):
     losses = write(hill(), tmp_path / "hill.xodr")
     assert losses[0].startswith("32 m of markers without a lane")
@@ -185,12 +241,12 @@ def test_a_map_without_landmarks_is_written(tmp_path: Path):
     assert [e.tag for e in ET.parse(tmp_path / "bare.xodr").getroot()] == ["header"]
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", [*WORLDS, "crossing"])
 def test_the_checker_of_asam_finds_nothing(world: str, tmp_path: Path):
     checker = shutil.which("qc_opendrive")
     if checker is None:
         pytest.skip("qc_opendrive (asam-qc-opendrive, in an environment of its own) is not on PATH")
-    write(WORLDS[world](), tmp_path / "map.xodr")
+    write({**WORLDS, "crossing": crossing}[world](), tmp_path / "map.xodr")
     (tmp_path / "config.xml").write_text(
         f'<Config><Param name="InputFile" value="{tmp_path / "map.xodr"}"/>'
         '<CheckerBundle application="xodrBundle">'
