@@ -86,9 +86,10 @@ def pooled_std(found: Sequence[Result], path: str) -> float:
 
 
 def weighted_mean(values: Sequence[float], weights: Sequence[float]) -> float:
-    """The mean of values that count differently; NaN of nothing."""
-    total = sum(weights)
-    return sum(v * w for v, w in zip(values, weights, strict=True)) / total if total else math.nan
+    """The mean of values that count differently, those left out that are unknown (NaN); NaN of nothing."""
+    known = [(v, w) for v, w in zip(values, weights, strict=True) if not math.isnan(v)]
+    total = sum(w for _, w in known)
+    return sum(v * w for v, w in known) / total if total else math.nan
 
 
 def seconds(found: Sequence[Result]) -> float:

@@ -55,3 +55,6 @@ def test_spreads_have_their_titles_and_bars_are_mean_and_sigma():
 def test_values_that_count_more_draw_the_mean_to_them():
     assert weighted_mean([1.0, 4.0], [2.0, 1.0]) == 2.0
     assert math.isnan(weighted_mean([], []))
+    # A map with one sign has no figure of how sure its signs are of one another.
+    assert weighted_mean([1.0, math.nan, 4.0], [2.0, 1.0, 1.0]) == 2.0
+    assert math.isnan(weighted_mean([math.nan], [1.0]))
