@@ -41,6 +41,7 @@ from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend, MapEquations
+from crowdmap_torch.processes.memory import give_back
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.residuals.lane import lane_prior, lane_stretch
 from crowdmap_torch.residuals.sign_prior import against_the_drive, habit_term, sign_place
@@ -163,6 +164,7 @@ def start(bundle: Bundle) -> lm.LmState:
     """The state before the first step: lanes matched, scales as wide as the residuals show."""
     bundle.fold(bundle.values())
     bundle.refresh()
+    give_back()
     return lm.init(bundle.problem(), bundle.values(), bundle.config.lm)
 
 
@@ -174,6 +176,7 @@ def steps(bundle: Bundle, state: lm.LmState, *, first: int = 0) -> Iterator[tupl
         if number and state.done:
             break
         state, _ = adjust_step(bundle, state, backend)
+        give_back()
         yield number, state
 
 
@@ -236,6 +239,8 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     if not bool(state.accepted.all()):
         return state, state.done
     evidence = pose_evidence(bundle.prior, normal, bundle.prior_scale, bundle.told())
+    # The next ones may need memory of their own.
+    del normal
     bundle.fold(dict(state.values))
     at_rest = bundle.refresh(evidence)
     if at_rest and (state.done or int(bundle.judged) == 0):

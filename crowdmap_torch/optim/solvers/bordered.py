@@ -145,28 +145,26 @@ class BorderedNormalEquations:
         return self.inner.variance_of_leaves()
 
     def _reduced(self, added: Float[Tensor, " z"]) -> Reduced:
-        """The border's own system, by the last factors of the inner one."""
-        x = self.inner.solve_eliminated(self.link)
-        by_landmark = self._coupled(x)
-        landmarks = self.inner.solve_reduced(by_landmark)
-        T = self.hessian + torch.diag(added) - by_landmark.mT @ landmarks
-        entry, size = self._entries(), len(self.gradient)
-        at = entry[:, :, None] * size + entry[:, None]
-        T.view(-1).index_add_(0, at.flatten(), -self._by_chain(x).flatten())
-        return Reduced(T, by_landmark, landmarks)
+        """The border's own system, by the last factors of the inner one.
 
-    def _coupled(self, x: Float[Tensor, "e k b"]) -> Float[Tensor, "r z"]:
-        """B A^-1 F of `x = A^-1 F`, less the landmarks' part of F."""
+        Variable by variable: A^-1 F of all of them is larger than what is solved.
+        """
         plan, owner = self.inner.structure.plan, self.inner.structure.owner
-        parts, first = [], 0
+        entry, size = self._entries(), len(self.gradient)
+        T, coupled, first = self.hessian + torch.diag(added), [], 0
         for name, offset in self.layout.offset.items():
-            width = self.layout.tangent_dim[name]
+            own = slice(first, first + self.layout.tangent_dim[name])
+            x = self.inner.solve_eliminated(self.link[..., own].contiguous())
             block = plan.border_block(name, owner)
-            of_name = x[..., first : first + width]
-            parts.append(self.inner.couple(of_name, block, len(offset)).flatten(1))
-            first += width
-        coupled = torch.cat(parts, dim=1)
-        return coupled - self.beside if self.beside.shape[1] else coupled
+            coupled.append(self.inner.couple(x, block, len(offset)).flatten(1))
+            at = entry[:, :, None] * size + entry[:, None, own]
+            T.view(-1).index_add_(0, at.flatten(), -self._by_chain(x).flatten())
+            first = own.stop
+        by_landmark = torch.cat(coupled, dim=1)
+        if self.beside.shape[1]:
+            by_landmark = by_landmark - self.beside
+        landmarks = self.inner.solve_reduced(by_landmark)
+        return Reduced(T - by_landmark.mT @ landmarks, by_landmark, landmarks)
 
     def _entries(self) -> Int[Tensor, "j b"]:
         """Where in the border the blocks of every chain are."""

@@ -118,6 +118,8 @@ class ChainBackend:
             if before is None or self._structure.order is not before.order:
                 block = values[self.plan.chains]
                 k = problem.variables[self.plan.chains].tangent_dim
+                # The old one goes before the new one comes.
+                self._workspace = None
                 self._workspace = Workspace.of(self._structure, block, k)
             self._pattern = SparsityPattern.of(problem, values)
         assert self._structure is not None and self._workspace is not None
