@@ -28,8 +28,8 @@ from crowdmap_torch.optim.solvers.chain_schur import (
     ChainBackend,
     ChainNormalEquations,
     Factor,
-    LandmarkCovariance,
 )
+from crowdmap_torch.optim.solvers.landmark_covariance import LandmarkCovariance
 from crowdmap_torch.optim.solvers.layout import Layout
 from crowdmap_torch.optim.solvers.normal_equations import (
     DIAGONAL_FLOOR,
