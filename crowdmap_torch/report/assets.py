@@ -88,6 +88,7 @@ th,td { padding:5px 9px; text-align:right; border-bottom:1px solid var(--line);
   white-space:nowrap; }
 th:first-child,td:first-child,.text { text-align:left; }
 td.text { white-space:normal; }
+td.text:first-child { min-width:11ch; }
 thead th { position:sticky; top:0; background:var(--stripe); color:var(--soft); font-weight:600; }
 table.sortable th { cursor:pointer; user-select:none; }
 table.sortable th:hover { color:var(--map); }
