@@ -4,12 +4,14 @@ BIN := $(VENV)/bin
 # Touched when the install is complete: the second `make install` has nothing to do.
 STAMP := $(VENV)/.installed
 DEMO := demo
+BENCH := bench
+AGAINST :=
 MUTANTS := 10000
 KILLS := 60
 SIGNALS := 10
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test soak test-coverage lint format docs
+.PHONY: help install demo bench test soak test-coverage lint format docs
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 16
@@ -27,6 +29,11 @@ demo: $(STAMP)  ## simulate a street, map it, compare the map with its survey; e
 	rm -rf $(DEMO)/street
 	$(BIN)/crowdmap simulate $(DEMO)/street --world street --journeys 8 --seed 1
 	$(BIN)/crowdmap optimize $(DEMO)/street --out $(DEMO)/run --overwrite
+
+# `make bench AGAINST=../older` runs another checkout beside it, in turns.
+bench: $(STAMP)  ## time and memory of each stage of the main job, 25 drives of a kilometre
+	test -d $(BENCH) || $(BIN)/crowdmap simulate $(BENCH) --world suburb --journeys 25 --length-m 1000 --vehicles 8 --seed 0
+	$(BIN)/crowdmap benchmark stages $(BENCH) $(if $(AGAINST),--against $(AGAINST))
 
 # Two cores: half of the mutants each. What fails stays in soak-failures/.
 soak: $(STAMP)  ## ten thousand destroyed inputs, sixty kills, twenty signals: no traceback, no hang, nothing lost without a word

@@ -15,6 +15,7 @@ BENCHMARKS = {
     "cluster": "clustering at scale, ours against scikit-learn",
     "journey": "one drive: throughput and latency of a step",
     "ladybug": "bundle adjustment in the large, ours against Ceres",
+    "stages": "the main job: time and memory of each stage, beside other states of the package",
     "viewer": "the page of crowdmap view: how fast it opens and draws",
 }
 
