@@ -33,7 +33,9 @@ def install(package: str) -> None:
     """
     decorate = jaxtyping.jaxtyped
 
-    def jaxtyped(*, typechecker: Any) -> Callable[[Any], Any]:
+    def jaxtyped(*context: Any, typechecker: Any = None) -> Any:
+        if context:
+            return decorate(*context)
         outermost = decorate(typechecker=typechecker)
 
         def decorated(made: Any) -> Any:
@@ -60,7 +62,9 @@ def _at_first(
         if file != _files:
             file, left = _files, CALLS
         if not left:
-            return function(*args, **options)
+            # Sizes that have a name have it in one call only.
+            with jaxtyping.jaxtyped("context"):
+                return function(*args, **options)
         left -= 1
         with_checks = with_checks or checks(function)
         return with_checks(*args, **options)
