@@ -29,12 +29,12 @@ NEAR = {"place_m": 2e-3, "turn_rad": 1e-5, "time_s": 1.1e-3, "pixel": 2e-3, "rig
 """How far a data set that was put right may be from the good one and still be it."""
 ROUGH = {
     "rounded": {"turn_rad": 0.02, "place_m": 0.06},
-    "whole-pixels": {"pixel": 0.72, "detections": 0.01},
+    "whole-pixels": {"pixel": 0.72},
     "boxes": {"detections": 0.03},
     "unit-pixels": {"pixel": 2e-2},
-    "row-by-row": {"detections": 0.05},
-    "frames-late": {"detections": 0.04},
-    "overlap": {"detections": 0.06},
+    "row-by-row": {"detections": 0.03},
+    "frames-late": {"detections": 0.03},
+    "overlap": {"detections": 0.02},
 }
 """What else a mistake has taken away for good: of outlines that are detected wrongly some are left out in one set only,
 frames at the ends of drives are lost, and a car that drives back over its way sees the same once more."""
