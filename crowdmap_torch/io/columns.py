@@ -41,6 +41,11 @@ class Lists:
         """The row each value belongs to."""
         return np.repeat(np.arange(len(self.count)), self.count)
 
+    def where(self, kept: Bool[np.ndarray, " p"]) -> Lists:
+        """The same rows with some of their values."""
+        count = np.bincount(self.row[kept], minlength=len(self.count))
+        return Lists(self.values[kept], count)
+
 
 class Sheet:
     """A Parquet file; only the columns asked for are read, others may be there."""
@@ -180,17 +185,20 @@ class Sheet:
     def ids(self, name: str) -> tuple[str, ...]:
         """Texts none of which is empty or stands in two rows."""
         names = self.strings(name).to_pylist()
-        if "" in names:
-            raise self.fault(f"column {name!r}: expected a name, found ''", names.index(""), "null")
-        if len(set(names)) < len(names):
-            first: dict[str, int] = {}
-            row = next(k for k, text in enumerate(names) if first.setdefault(text, k) != k)
-            raise self.fault(
-                f"column {name!r}: {names[row]!r} stands in row {first[names[row]]} too; "
-                "expected each name once",
-                row,
-                "name-twice",
-            )
+        is_empty = np.array([text == "" for text in names], dtype=bool)
+        rule = f"column {name!r}: expected a name, found ''"
+        self.refuse(is_empty, lambda _: rule, name, code="null")
+        first: dict[str, int] = {}
+        earlier = np.array([first.setdefault(text, k) for k, text in enumerate(names)], dtype=int)
+        self.refuse(
+            (earlier != np.arange(len(names))) & ~is_empty,
+            lambda row: (
+                f"column {name!r}: {names[row]!r} stands in row {earlier[row]} too; "
+                "expected each name once"
+            ),
+            name,
+            code="name-twice",
+        )
         return tuple(names)
 
     def number_lists(self, name: str, count: int | None = None, *, optional: bool = False) -> Lists:
@@ -201,14 +209,15 @@ class Sheet:
         size = _lengths(column)
         row = np.repeat(np.arange(len(self)), size)
         lists = Lists(self._values(name, column.flatten(), row), size)
-        if count is not None:
-            self.refuse(
-                column.is_valid().to_numpy(zero_copy_only=False) & (size != count),
-                lambda row: f"column {name!r}: expected {count} numbers, found {size[row]}",
-                name,
-                code="point-count",
-            )
-        return lists
+        if count is None:
+            return lists
+        self.refuse(
+            column.is_valid().to_numpy(zero_copy_only=False) & (size != count),
+            lambda row: f"column {name!r}: expected {count} numbers, found {size[row]}",
+            name,
+            code="point-count",
+        )
+        return lists.where(size[row] == count)
 
     def points(self, name: str, *, optional: bool = False) -> Lists:
         """A point of three numbers in each row; where `optional`, `count` is 0 for none."""
@@ -225,34 +234,44 @@ class Sheet:
         count = _lengths(column)
         row = np.repeat(np.arange(len(self)), count)
         inner = column.flatten()
-        if inner.null_count:
-            bad = int(inner.is_null().to_numpy(zero_copy_only=False).argmax())
-            rule = f"column {name!r}: a point is null; expected 3 numbers"
-            raise self.fault(rule, int(row[bad]), "null")
+        is_null = inner.is_null().to_numpy(zero_copy_only=False)
+        rule = f"column {name!r}: a point is null; expected 3 numbers"
+        self.refuse(self._any(row[is_null]), lambda _: rule, name, code="null")
         if pa.types.is_null(inner.type):
-            return Lists(np.zeros((0, 3)), count)
-        size = _lengths(inner)
-        if (size != 3).any():
-            bad = int((size != 3).argmax())
-            rule = f"column {name!r}: a point has {size[bad]} numbers; expected 3"
-            raise self.fault(rule, int(row[bad]), "point-count")
-        values = self._values(name, inner.flatten(), np.repeat(row, 3))
-        points = Lists(values.reshape(-1, 3), count)
+            return Lists(np.zeros((0, 3)), np.zeros_like(count))
+        size = np.where(is_null, 0, _lengths(inner))
+        is_off = ~is_null & (size != 3)
+        first = {int(row[at]): size[at] for at in np.flatnonzero(is_off)[::-1]}
+        self.refuse(
+            self._any(row[is_off]),
+            lambda row: f"column {name!r}: a point has {first[row]} numbers; expected 3",
+            name,
+            code="point-count",
+        )
+        values = self._values(name, inner.flatten(), np.repeat(row, size))
+        whole = Lists(np.zeros((len(row), 3)), count).where(size == 3)
+        points = Lists(values[np.repeat(size == 3, size)].reshape(-1, 3), whole.count)
         self._refuse_far(name, points)
         return points
 
     def _refuse_far(self, name: str, points: Lists) -> None:
         """Refuses points that are not near the origin, as nothing in these files is."""
         far = np.abs(points.values).max(axis=-1, initial=0.0) > MAX_PLACE_M
-        if far.any():
-            at = int(far.argmax())
+        row = points.row
+
+        def rule(bad: int) -> str:
+            at = int((far & (row == bad)).argmax())
             place = ", ".join(f"{x:.7g}" for x in points.values[at])
-            raise self.fault(
+            return (
                 f"column {name!r}: ({place}) is over {MAX_PLACE_M / 1000:,.0f} km from the origin; "
-                "expected metres east, north and up of it",
-                int(points.row[at]),
-                "far-away",
+                "expected metres east, north and up of it"
             )
+
+        self.refuse(self._any(row[far]), rule, name, code="far-away")
+
+    def _any(self, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " n"]:
+        """Which rows of the sheet are among these."""
+        return np.bincount(rows, minlength=len(self)).astype(bool)
 
     def _refuse_long(self, name: str, column: pa.Array) -> None:
         """Refuses texts that repeat until they fill the memory."""
@@ -273,10 +292,8 @@ class Sheet:
         if bad.any():
             first = int(bad.argmax())
             found = values[first] if flat[first].is_valid else "null"
-            is_bad = np.zeros(len(self), dtype=bool)
-            is_bad[row[bad]] = True
             rule = f"column {name!r}: expected finite numbers, found {found}"
-            self.refuse(is_bad, lambda _: rule, name, code="not-finite")
+            self.refuse(self._any(row[bad]), lambda _: rule, name, code="not-finite")
         return values
 
     def _column(

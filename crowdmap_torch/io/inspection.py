@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -26,16 +26,18 @@ from crowdmap_torch.io.detections import read_lane_detections, read_sign_detecti
 from crowdmap_torch.io.documents import read_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.faults import Fault, attempted, gathered, gathering
+from crowdmap_torch.io.maps import read_map_head
 from crowdmap_torch.io.poses import read_poses
 from crowdmap_torch.io.rigs import MAX_SIDE_PX, faults_of_rig, missing_rig
-from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.io.surveys import read_surveyed_lanes, read_surveyed_signs, survey_files
+from crowdmap_torch.tables import Origin
 
 
 def inspect_dataset(folder: Path) -> tuple[Fault, ...]:
     """All faults of the files of a dataset, in the order of files; InputError if there is no such folder.
 
-    Of a Parquet file every wrong row is named, of dataset.json, journey.json and rig.yaml every wrong key, of the survey the
-    first fault of all. Rows that the mapper leaves out are among them (`Fault.drops`).
+    Of a Parquet file every wrong row is named, of dataset.json, journey.json, rig.yaml and a survey's map.json every wrong
+    key. Rows that the mapper leaves out are among them (`Fault.drops`).
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: the dataset's folder is missing; expected dataset.json in it")
@@ -47,8 +49,8 @@ def inspect_dataset(folder: Path) -> tuple[Fault, ...]:
             journeys = journey_folders(folder)
         for journey in journeys:
             _journey(journey, folder / "rigs", cameras)
-    with reading(inside=folder):
-        return (*faults, *_of_survey(folder))
+        _of_survey(folder)
+        return tuple(faults)
 
 
 def _head(path: Path) -> None:
@@ -133,22 +135,33 @@ _ANY = _any_camera()
 """Stands for a camera that is not known."""
 
 
-def _of_survey(folder: Path) -> Iterable[Fault]:
+def _of_survey(folder: Path) -> None:
     survey = folder / "survey"
     if not survey.exists():
         return
-    try:
-        read = read_survey(survey)
-        origin = read_origin(read_json(folder / "dataset.json"))
-    except InputError as error:
-        text = str(error)
-        path = next((p for p in sorted(survey.glob("*")) if text.startswith(f"{p}: ")), survey)
-        if not text.startswith(f"{folder / 'dataset.json'}"):
-            yield Fault(path, text.removeprefix(f"{path}: "), error.code)
-        return
-    if not origin.is_same(read.origin):
-        yield Fault(
-            survey / "map.json",
-            f"origin: {read.origin}; expected that of dataset.json, {origin}",
-            "value",
-        )
+    with attempted(survey / "map.json"):
+        _survey_head(survey, folder / "dataset.json")
+    with attempted(survey):
+        signs, lanes = survey_files(survey)
+        if signs is not None:
+            with attempted(signs):
+                read_surveyed_signs(signs)
+        if lanes is not None:
+            with attempted(lanes):
+                read_surveyed_lanes(lanes)
+
+
+def _survey_head(survey: Path, dataset: Path) -> None:
+    told = len(gathered() or ())
+    found, expected = read_origin(read_map_head(survey)), _origin_of(dataset)
+    if len(gathered() or ()) == told and expected is not None and not expected.is_same(found):
+        rule = f"origin: {found}; expected that of dataset.json, {expected}"
+        raise InputError(f"{survey / 'map.json'}: {rule}", "value")
+
+
+def _origin_of(dataset: Path) -> Origin | None:
+    """The origin in dataset.json; None where it is wrong, which has been told."""
+    with gathering() as wrong, attempted(dataset):
+        origin = read_origin(read_json(dataset))
+        return None if wrong else origin
+    return None

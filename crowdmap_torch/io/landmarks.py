@@ -178,7 +178,9 @@ def read_corners(
     )
     slot = np.minimum(np.arange(polygon.MAX_CORNERS), expected[:, None] - 1)
     padded = np.full((len(sheet), polygon.MAX_CORNERS, 3), np.nan)
-    padded[known] = lists.values[(lists.start[:, None] + slot)[known]]
+    # All that are known, but where faults are gathered.
+    fits = known & (lists.count == expected)
+    padded[fits] = lists.values[(lists.start[:, None] + slot)[fits]]
     return torch.from_numpy(padded), known
 
 
@@ -189,6 +191,7 @@ def read_normals(sheet: Sheet, corners_world: Float[Tensor, "n 8 3"]) -> Float[T
     sheet.refuse(
         (length <= 1e-12).numpy(),
         lambda row: "column 'corners': they lie on a line; expected a polygon",
+        code="value",
     )
     normal = turning / length[:, None]
     if "normal" not in sheet:
@@ -198,7 +201,7 @@ def read_normals(sheet: Sheet, corners_world: Float[Tensor, "n 8 3"]) -> Float[T
     size = np.sqrt(np.square(given.values).sum(-1))
     off = np.zeros(len(sheet), dtype=bool)
     off[known] = np.abs(size - 1) > UNIT_TOLERANCE
-    sheet.refuse(off, lambda row: "column 'normal': expected a unit vector")
+    sheet.refuse(off, lambda row: "column 'normal': expected a unit vector", code="value")
     unit = torch.from_numpy(given.values / np.where(size > 0, size, 1.0)[:, None])
     backwards = np.zeros(len(sheet), dtype=bool)
     backwards[known] = ((unit * normal[known]).sum(-1) < 0).numpy()
@@ -208,6 +211,7 @@ def read_normals(sheet: Sheet, corners_world: Float[Tensor, "n 8 3"]) -> Float[T
             "corners run anticlockwise as the normal's side sees them; expected clockwise, "
             "with the normal pointing at the driver"
         ),
+        code="value",
     )
     return normal.index_put((torch.from_numpy(known),), unit)
 
@@ -292,13 +296,16 @@ def _refuse_sigma(
 ) -> None:
     """Refuses a sigma whose inverse square is no weight; NaN is unknown."""
     off = (sigma < MIN_SIGMA_M) | (sigma > MAX_PLACE_M)
-    if off.any():
-        at = int(off.argmax())
-        raise sheet.fault(
-            f"column 'sigma_m': expected {MIN_SIGMA_M:g} to {MAX_PLACE_M:g} m, found {sigma[at]}; "
-            "leave it null if it is unknown",
-            at if row_of is None else int(row_of[at]),
-        )
+    row_of = np.arange(len(sheet)) if row_of is None else row_of
+    sheet.refuse(
+        np.bincount(row_of[off], minlength=len(sheet)).astype(bool),
+        lambda row: (
+            f"column 'sigma_m': expected {MIN_SIGMA_M:g} to {MAX_PLACE_M:g} m, "
+            f"found {sigma[off & (row_of == row)][0]}; leave it null if it is unknown"
+        ),
+        "sigma_m",
+        code="range",
+    )
 
 
 def _turning(corners: Tensor) -> Tensor:

@@ -27,16 +27,11 @@ def read_survey(path: Path | str) -> Survey:
 
 def _read_survey(folder: Path) -> Survey:
     head = read_map_head(folder)
-    signs_path, lanes_path = folder / "signs.parquet", folder / "lanes.parquet"
-    has_signs, has_lanes = (os.path.lexists(path) for path in (signs_path, lanes_path))
-    if not has_signs and not has_lanes:
-        raise InputError(
-            f"{folder}: has neither signs.parquet nor lanes.parquet; expected one", "missing-file"
-        )
-    sign_id, signs = _read_signs(signs_path) if has_signs else ((), _no_signs())
+    signs_path, lanes_path = survey_files(folder)
+    sign_id, signs = read_surveyed_signs(signs_path) if signs_path else ((), _no_signs())
     lane_id, lane_type, lane_points = (), _integers(), _no_points()
-    if has_lanes:
-        lane_id, lane_type, lane_points = _read_lanes(lanes_path)
+    if lanes_path:
+        lane_id, lane_type, lane_points = read_surveyed_lanes(lanes_path)
     return Survey(
         origin=read_origin(head),
         sign_id=sign_id,
@@ -47,7 +42,18 @@ def _read_survey(folder: Path) -> Survey:
     )
 
 
-def _read_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
+def survey_files(folder: Path) -> tuple[Path | None, Path | None]:
+    """Its files of signs and of lanes, None for one that is not there; InputError if there is neither."""
+    paths = folder / "signs.parquet", folder / "lanes.parquet"
+    signs, lanes = (path if os.path.lexists(path) else None for path in paths)
+    if signs is None and lanes is None:
+        rule = f"{folder}: has neither signs.parquet nor lanes.parquet; expected one"
+        raise InputError(rule, "missing-file")
+    return signs, lanes
+
+
+def read_surveyed_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
+    """Names of signs and where they are, by name. Where faults are gathered all are, and the signs are worth nothing."""
     sheet = Sheet(path, ("sign_id", "shape"), ("corners", "center", "normal", "sigma_m"))
     sign_id = sheet.ids("sign_id")
     shape = torch.from_numpy(sheet.codes("shape", polygon.SHAPES))
@@ -73,7 +79,8 @@ def _read_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
     return tuple(sign_id[k] for k in order), signs[torch.tensor(order, dtype=torch.int64)]
 
 
-def _read_lanes(path: Path) -> tuple[tuple[str, ...], torch.Tensor, SurveyLanePoints]:
+def read_surveyed_lanes(path: Path) -> tuple[tuple[str, ...], torch.Tensor, SurveyLanePoints]:
+    """Names of lane markers, their types and points, by name; faults as of signs."""
     sheet = Sheet(path, ("lane_id", "points"), ("type",))
     lane_id = sheet.ids("lane_id")
     points = sheet.point_lists("points")

@@ -150,8 +150,51 @@ def test_a_survey_is_looked_at_too(bad: Path) -> None:
     (fault,) = refused(bad)
     assert fault.path == bad / "survey" / "map.json" and "expected that of" in fault.rule
     (bad / "survey" / "signs.parquet").write_bytes(b"nothing")
-    (fault,) = refused(bad)
-    assert fault.path == bad / "survey" / "signs.parquet"
+    assert [fault.path.name for fault in refused(bad)] == ["map.json", "signs.parquet"]
+
+
+def test_every_fault_of_a_survey_is_named(bad: Path) -> None:
+    survey = bad / "survey"
+    head = json.loads((survey / "map.json").read_text())
+    head["version"], head["origin"]["lat_deg"] = 2, "north"
+    (survey / "map.json").write_text(json.dumps(head))
+    signs = pq.read_table(survey / "signs.parquet").to_pydict()
+    assert len(signs["sign_id"]) >= 6
+    signs["sign_id"][1] = signs["sign_id"][0]
+    signs["shape"][2] = "circle"
+    signs["corners"][3] = signs["corners"][3][:-1]
+    signs["corners"][4][0] = [0.0, 1.0]
+    signs["corners"][5][1][2] = float("nan")
+    signs["corners"][0] = signs["corners"][0][::-1]
+    columns = {"corners": pa.list_(pa.list_(pa.float64()))}
+    sigma = [0.02] * len(signs["sign_id"])
+    sigma[0] = sigma[2] = -1.0
+    table = {name: pa.array(rows, columns.get(name)) for name, rows in signs.items()}
+    pq.write_table(pa.table(table | {"sigma_m": pa.array(sigma)}), survey / "signs.parquet")
+    lanes = pq.read_table(survey / "lanes.parquet").to_pydict()
+    lanes["lane_id"][0] = ""
+    lanes["points"][1] = lanes["points"][1][:1]
+    lanes["points"][2][3] = [1e7, 0.0, 0.0]
+    lanes["points"][3][0] = None
+    pq.write_table(
+        pa.table({"lane_id": lanes["lane_id"], "points": lanes["points"]}), survey / "lanes.parquet"
+    )
+    found = [(fault.path.name, fault.code, fault.rows) for fault in refused(bad)]
+    assert found == [
+        ("map.json", "other-version", ()),
+        ("map.json", "value", ()),
+        ("signs.parquet", "name-twice", (1,)),
+        ("signs.parquet", "unknown-name", (2,)),
+        ("signs.parquet", "point-count", (4,)),
+        ("signs.parquet", "not-finite", (5,)),
+        ("signs.parquet", "point-count", (3,)),
+        ("signs.parquet", "value", (0,)),
+        ("signs.parquet", "range", (0, 2)),
+        ("lanes.parquet", "null", (0,)),
+        ("lanes.parquet", "null", (3,)),
+        ("lanes.parquet", "far-away", (2,)),
+        ("lanes.parquet", "point-count", (1,)),
+    ]
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:
