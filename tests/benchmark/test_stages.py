@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 import pytest
+from worlds.programs import checkout
 
 from crowdmap_torch.benchmark import stages
 from crowdmap_torch.io.errors import InputError
@@ -21,15 +22,6 @@ out.mkdir()
 found = {"signs": {"relative": {"total": {"mean": ERROR}}}}
 (out / "metrics.json").write_text(json.dumps({"times_s": {"mapping": 0.25}, "survey": found}))
 """
-
-
-def checkout(folder: Path, main: str) -> Path:
-    """Another state of the package, of which there is the main job alone."""
-    package = folder / "crowdmap_torch"
-    package.mkdir(parents=True)
-    (package / "__main__.py").write_text(main)
-    (package / "__init__.py").touch()
-    return folder
 
 
 @pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="memory is read in /proc")

@@ -9,6 +9,8 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from conftest import data_folder
+from worlds.pages import PAGES, said, words_of
 
 from crowdmap_torch.cli import main
 from crowdmap_torch.studies import all as every
@@ -55,6 +57,13 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Quick:
     out = tmp_path_factory.mktemp("study")
     asked = Quick(out, -1)
     return Quick(out, main(asked.arguments()))
+
+
+def choose_real_drives(folder: Path, kitti: Path) -> None:
+    """A folder with the shortest of the real drives alone."""
+    folder.mkdir()
+    for name in ("kitti-06", "eligible.json"):
+        (folder / name).symlink_to(kitti / name)
 
 
 def test_the_page_has_a_section_for_every_study(quick: Quick):
@@ -134,11 +143,8 @@ def test_real_drives_are_skipped_with_a_reason(tmp_path: Path):
 
 
 def test_real_drives_make_a_table(tmp_path: Path, real_data: Callable[[str], Path]):
-    kitti = real_data("kitti-signs")
     chosen = tmp_path / "drives"
-    chosen.mkdir()
-    (chosen / "kitti-06").symlink_to(kitti / "kitti-06")
-    (chosen / "eligible.json").symlink_to(kitti / "eligible.json")
+    choose_real_drives(chosen, real_data("kitti-signs"))
     arguments = ["--quick", "--out", str(tmp_path / "out"), "--processes", "1"]
     assert main(["study", "real", *arguments, "--real", str(chosen)]) == 0
     with (tmp_path / "out" / "quick" / "tables" / "real.csv").open(encoding="utf-8") as file:
@@ -146,6 +152,24 @@ def test_real_drives_make_a_table(tmp_path: Path, real_data: Callable[[str], Pat
     ours = next(row for row in rows if row["method"] == "ours")
     assert ours["eligible"] == ours["mapped"] == "2"
     assert 0 < float(ours["mean [m]"]) < 1
+
+
+STUDIED = [c.text for page in PAGES for c in said(page) if c.text.startswith("crowdmap study ")]
+
+
+@pytest.mark.parametrize("command", sorted(set(STUDIED)))
+def test_the_studies_that_pages_name_run(command: str, quick: Quick, tmp_path: Path):
+    known = {"DIR": tmp_path / "drives", "SEGMENT": data_folder() / "comma2k19" / "example_1"}
+    words = [str(known.get(word, word)) for word in words_of(command)[1:]]
+    if (data_folder() / "kitti-signs").exists():
+        choose_real_drives(known["DIR"], data_folder() / "kitti-signs")
+    else:
+        for option in {"--real", "--recorded-errors"} & set(words):
+            del words[(at := words.index(option)) : at + 2]
+    try:
+        assert main([*words, *quick.arguments()[2:]]) == 0
+    except SystemExit as ended:
+        assert "--help" in words and ended.code == 0
 
 
 def _a_map(quick: Quick) -> Path:
