@@ -23,7 +23,7 @@ from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import read_truth
 from crowdmap_torch.optim import band_cholesky
 from crowdmap_torch.optim.linearize import term_costs
-from crowdmap_torch.optim.solvers import tiled_cholesky, windows
+from crowdmap_torch.optim.solvers import sparse_tiles, windows
 from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of
 from crowdmap_torch.tables import Dataset, Rows, to_device
 
@@ -65,7 +65,9 @@ def one_way_to_compute() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(band_cholesky, "_by_lapack", band_cholesky._by_blocks)
         patch.setattr(windows, "_in_place", lambda device: False)
-        patch.setattr(tiled_cholesky, "_by_tiles", lambda matrix: False)
+        # Small ones, so that there are many.
+        for name, width in (("_ONE_TILE", 100), ("_WIDTH", 64), ("_WIDTH_CUDA", 64)):
+            patch.setattr(sparse_tiles, name, width)
         yield
 
 

@@ -20,6 +20,7 @@ from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import CalibrationConfig, fleet_of
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.covariance import MapUncertainty
+from crowdmap_torch.adjustment.cuts import cut_drives
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes, supported_lanes
 from crowdmap_torch.adjustment.lenses import lenses_of
 from crowdmap_torch.adjustment.observations import (
@@ -97,16 +98,21 @@ def build(
     frame = torch.nonzero(kept)[:, 0]
     nodes = _nodes(journeys, frame, config)
     at_nodes = drift[frame][nodes.first]
+    lane = spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count)
+    place, unknowns = given[frame][nodes.first][:, :2, 3], 8 * len(signs) + lane.numel()
+    cut = cut_drives(place, nodes.journey, unknowns, config.cut_unknowns)
     poses = pose_prior(
-        journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior
+        *(journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior, cut)
     )
+    at_start = poses.with_wander(at_nodes)
     values = {
         "pose": start[frame],
-        "drift": poses.with_wander(at_nodes),
+        "drift": at_start,
+        "cut": poses.at_cuts(at_start),
         "bias": nodes.mean(at_nodes, len(journeys)),
         "sign": signs.T_world_sign,
         "size": signs.size,
-        "lane": spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count),
+        "lane": lane,
     }
     unknown = calibration or CalibrationConfig.off()
     of_frame = nodes.journey[nodes.of_frame]
@@ -161,11 +167,13 @@ def adjust(bundle: Bundle) -> lm.LmState:
 @one_core_each()
 @torch.no_grad()
 def start(bundle: Bundle) -> lm.LmState:
-    """The state before the first step: lanes matched, scales as wide as the residuals show."""
+    """The state before the first step: lanes matched, scales as wide as residuals show, the order of elimination found."""
     bundle.fold(bundle.values())
     bundle.refresh()
+    problem, values = bundle.problem(), bundle.values()
+    bundle.backend().prepare(problem, values)
     give_back()
-    return lm.init(bundle.problem(), bundle.values(), bundle.config.lm)
+    return lm.init(problem, values, bundle.config.lm)
 
 
 def steps(bundle: Bundle, state: lm.LmState, *, first: int = 0) -> Iterator[tuple[int, lm.LmState]]:

@@ -25,6 +25,7 @@ from crowdmap_torch.adjustment.shared_corner_errors import (
 )
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, white_scales
+from crowdmap_torch.noise.pose_prior import CUT_TERMS
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
 from crowdmap_torch.optim.problem import (
@@ -38,7 +39,6 @@ from crowdmap_torch.optim.problem import (
 )
 from crowdmap_torch.optim.robust import JointTukey, Tukey
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
-from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBackend
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
@@ -68,12 +68,14 @@ _LASTING_RESTS = 0.1
 VARIABLES = {
     "pose": Variable(6, se3.retract, pull=se3.pull),
     "drift": Variable(6, euclidean, pull=pull_euclidean),
+    "cut": Variable(6, euclidean, pull=pull_euclidean),
     "bias": Variable(6, euclidean, pull=pull_euclidean),
     "sign": Variable(6, se3.retract, pull=se3.pull),
     "size": Variable(2, positive, pull=pull_positive),
     "lane": Variable(3, euclidean, pull=pull_euclidean),
 }
-"""The unknowns: camera poses, their slow errors and each journey's constant one; signs, their sides, lanes' coefficients."""
+"""The unknowns: camera poses, their slow errors, at stretches of road and where long drives are cut, and each journey's
+constant one; signs, their sides, lanes' coefficients."""
 
 
 class Bundle(nn.Module):
@@ -121,7 +123,8 @@ class Bundle(nn.Module):
         }
         self.variables = VARIABLES | own
         wide = values["drift"].shape[1]
-        self.variables["drift"] = replace(VARIABLES["drift"], tangent_dim=wide)
+        for name in ("drift", "cut"):
+            self.variables[name] = replace(VARIABLES[name], tangent_dim=wide)
         self.names = tuple(values)
         for name, value in values.items():
             self.register_buffer(f"base_{name}", value.clone())
@@ -161,18 +164,26 @@ class Bundle(nn.Module):
         self._by_mount = self.fleet.by_mount(values["pose"])
         self._detections = KeptDetections()
         self._plan = self._elimination()
+        self._backend: BorderedBackend | None = None
 
     @torch.no_grad()
     def _elimination(self) -> EliminationPlan:
-        """Frames hang on the drift's chains, both are eliminated, the biases go last.
+        """Frames hang on the drift's chains, both are eliminated; what drives have to themselves or share goes last.
 
         Landmarks are ranked as they start. From step to step lane points go over to the next control point, no further.
         """
-        nodes, terms = self.prior.nodes, (self._corner_term, self._lane_terms)
+        prior, terms = self.prior, (self._corner_term, self._lane_terms)
         seen = {name: term for make in terms for name, term in make(1.0).items()}
-        shared = dict.fromkeys(self.fleet.variables, self.fleet.of_journey)
-        chain, of_frame = nodes.journey, nodes.of_frame
-        plan = EliminationPlan("drift", chain, "pose", of_frame, border="bias", shared=shared)
+        at_cuts = prior.terms(self.prior_scale, self.white_scale)
+        seen |= {name: at_cuts[name] for name in CUT_TERMS if name in at_cuts}
+        of_journey = prior.journey_of_chain
+        of_cars = {name: self.fleet.of_journey[of_journey] for name in self.fleet.variables}
+        plan = EliminationPlan(
+            *("drift", prior.chain, "pose", prior.nodes.of_frame),
+            border={"bias": of_journey, **of_cars},
+            joints="cut",
+            joint=prior.joint,
+        )
         values = self.values()
         problem = Problem(self.variables, {**seen, **self._slide_term()})
         return planned_ahead(problem, values, plan, sliding=("lane",))
@@ -190,6 +201,7 @@ class Bundle(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Bundle:
         """What `.to(device)` calls: the tables follow the unknowns."""
         super()._apply(fn, recurse)
+        self._backend = None
         self.__dict__.update(to_device(vars(self), self.scale.device))
         return self
 
@@ -215,13 +227,10 @@ class Bundle(nn.Module):
             getattr(self, f"base_{name}").copy_(values[name])
             getattr(self, f"delta_{name}").zero_()
 
-    def backend(self) -> MapBackend:
-        """The solver's back end: dense landmarks, or conjugate gradients where there are too many for that."""
-        landmarks = ("sign", "size", "lane")
-        unknowns = sum(getattr(self, f"delta_{name}").numel() for name in landmarks)
-        if unknowns > self.config.dense_unknowns:
-            return ConjugateGradientBackend(self._plan, samples=self.config.covariance_samples)
-        return BorderedBackend(self._plan)
+    def backend(self) -> BorderedBackend:
+        """The solver's back end, with the order of elimination and the memory that the last problem took."""
+        self._backend = self._backend or BorderedBackend(self._plan)
+        return self._backend
 
     @torch.no_grad()
     def refresh(self, evidence: PoseEvidence | None = None) -> bool:

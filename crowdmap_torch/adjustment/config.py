@@ -90,11 +90,9 @@ class AdjustConfig(Settings):
     """Lane points that meet the road further ahead are left out."""
     frame_spacing_m: Spacing = 0.25
     """Frames closer together than this (a car at a light) are thinned."""
-    dense_unknowns: CountOrNone = 12000
-    """Unknowns of signs and lanes up to which their system is one dense matrix; larger ones are solved by conjugate
-    gradients, matrix-free, and their covariances estimated from samples."""
-    covariance_samples: Count = 64
-    """Samples of the map that such covariances are estimated from; their sigmas are then good to 9 %."""
+    cut_unknowns: CountOrNone = 800
+    """Drives over a larger map are cut into stretches along which signs and lanes have about so many unknowns, and
+    solved for between the cuts: time and memory grow with the way driven, no faster. 0: none is. The map is the same."""
 
     def __post_init__(self) -> None:
         """Refuses unknown methods and Jacobians."""

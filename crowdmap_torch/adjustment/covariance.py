@@ -1,7 +1,7 @@
 """How sure an adjusted map is: covariances of signs, their corners, lanes and journeys' errors, from one factorisation.
 
 The covariance of the landmarks is the inverse of the reduced system that bundle adjustment solves, poses and biases
-marginalised; what all positions share is kept apart. Of a map too large for that inverse, samples are drawn instead.
+marginalised, as far as landmarks are bound to each other; what all positions share is kept apart.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
     count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)
     of_mean = to_bias.new_zeros(len(to_bias), bundle.prior.numbers, 4)
     of_mean[:, :6] = to_bias.mT / count[nodes.journey, None, None]
-    of_bias = covariance.of_chain_sums(of_mean)
+    of_bias = covariance.of_sums(of_mean, bundle.prior.journey_of_chain, journeys)
     every = torch.arange(len(signs), device=count.device)
     sign = LinearFunctions.of_tangents((("sign", every), ("size", every)), to_bias, 6, 2)
     of_sign = covariance.of(sign)

@@ -1,10 +1,11 @@
 """What the positioning module gets wrong, as a prior of bundle adjustment (V-B, footnote).
 
 The error of a journey's poses is a bias, a slow drift on top of it, a Gauss-Markov chain along the way, and white noise
-from frame to frame. `drift` is the error without the noise, at nodes a few metres apart: it is drawn towards the
-journey's `bias`, and the bias towards zero. Where one drive is so long that its bias wanders (`bias_wander`), `drift` has
-three numbers more: how far the bias is from the constant one at the node. The sigmas are the module's own where it gives
-them; how far each journey is from them shows when many have seen the same.
+from frame to frame. `drift` is the error without the noise, at nodes a few metres apart: it is drawn towards the journey's
+`bias`, and the bias towards zero. Where one drive is so long that its bias wanders (`bias_wander`), `drift` has three
+numbers more: how far the bias is from the constant one at the node. Long drives are cut: where two nodes part, the state of
+the chain between them is an unknown of its own, `cut`, and what it is made of is known on either side. The sigmas are the
+module's own where it gives them; how far each journey is from them shows when many have seen the same.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
 from crowdmap_torch.tables import Journey
 
+CUT_TERMS = ("pose_before_cut", "pose_behind_cut")
+"""The terms by which states at cuts are bound to the nodes around them."""
 _SWEEPS = 60
 """Alternations between scales and what all journeys share."""
 LEAST_SIGMA_M = 1e-3
@@ -99,7 +102,9 @@ class PosePrior:
     begins: Int[Tensor, " c"]
     """First node of each journey's chain."""
     follows: Int[Tensor, " e"]
-    """Nodes that another one of their journey follows."""
+    """Nodes that another one of their journey follows, no cut between them."""
+    cut: Int[Tensor, " s"]
+    """Nodes that a cut is right before, in order."""
     far: Int[Tensor, "q 2"]
     """Nodes about `scale_lag_m` apart, each the end of at most one such pair."""
     config: PosePriorConfig
@@ -125,6 +130,34 @@ class PosePrior:
         way, journey = self.nodes.way, self.nodes.journey
         return torch.cat((error, first_wander(error[:, :3], way, journey, self.wander)), dim=1)
 
+    @property
+    def chain(self) -> Int[Tensor, " n"]:
+        """The stretch between two cuts, or of a whole journey, that each node is of."""
+        begins = _begins(self.nodes.journey)
+        begins[self.cut] = True
+        return begins.cumsum(0) - 1
+
+    @property
+    def journey_of_chain(self) -> Int[Tensor, " chains"]:
+        """The journey of each such stretch."""
+        begins = _begins(self.nodes.journey)
+        begins[self.cut] = True
+        return self.nodes.journey[begins]
+
+    @property
+    def joint(self) -> Int[Tensor, "chains 2"]:
+        """The cut that each such stretch begins at and the one that it ends at; -1: none."""
+        chain = self.chain
+        found = torch.full((len(self.journey_of_chain), 2), -1, device=chain.device)
+        number = torch.arange(len(self.cut), device=chain.device)
+        found[chain[self.cut], 0] = number
+        found[chain[self.cut - 1], 1] = number
+        return found
+
+    def at_cuts(self, drift: Float[Tensor, "n k"]) -> Float[Tensor, "s k"]:
+        """Where the states at cuts may begin: half way between those around them."""
+        return (drift[self.cut - 1] + drift[self.cut]) / 2
+
     def about_bias(self, drift: Float[Tensor, "n k"]) -> Float[Tensor, "n 6"]:
         """The drift at the nodes less what the bias is there beside its constant."""
         if self.wander is None:
@@ -139,17 +172,26 @@ class PosePrior:
         bias, drift = self._scaled(scale)
         noise = self.white_sigma * white_scale.repeat_interleave(3, dim=1)
         white = (noise.square() + self.within_stretch(scale)).sqrt()
-        journey, follows = nodes.journey, self.follows
-        gap = (nodes.way[follows + 1] - nodes.way[follows]).clamp_min(0.1)[:, None]
-        reach = self.length_m[journey[follows]]
-        start, far = residuals.gauss_markov_start, drift
+        journey = nodes.journey
+        start, far, length = residuals.gauss_markov_start, drift, self.length_m
         way, moves = residuals.gauss_markov_step, residuals.gauss_markov_step_jacobian
         if self.wander is not None:
             start = residuals.wandering_start
             way, moves = residuals.wandering_step, residuals.wandering_step_jacobian
             far = torch.cat((drift, self.wander.sigma * scale[:, 3:]), dim=1)
-            reach = torch.cat((reach, self.wander.length_m + 0 * reach[:, :3]), dim=1)
-        step = far[journey[follows]] * (-torch.expm1(-2 * gap / reach)).sqrt()
+            length = torch.cat((length, self.wander.length_m + 0 * length[:, :3]), dim=1)
+
+        def steps(name: str, first: Int[Tensor, " e"], share: float) -> CostTerm:
+            """Steps over this share of the way from each node to the next."""
+            own = journey[first]
+            gap = share * (nodes.way[first + 1] - nodes.way[first]).clamp_min(0.1)[:, None]
+            step = far[own] * (-torch.expm1(-2 * gap / length[own])).sqrt()
+            keep = torch.exp(-gap / length[own])
+            return CostTerm(way, self.slots[name], (keep,), weight=1 / step, jacobian=moves)
+
+        cuts = {}
+        if len(self.cut):
+            cuts = {name: steps(name, self.cut - 1, 0.5) for name in CUT_TERMS}
         return {
             "pose_bias": CostTerm(
                 residuals.gauss_markov_start,
@@ -164,13 +206,8 @@ class PosePrior:
                 weight=1 / far[journey[self.begins]],
                 takes_rows=True,
             ),
-            "pose_relative": CostTerm(
-                way,
-                self.slots["pose_relative"],
-                (torch.exp(-gap / reach),),
-                weight=1 / step,
-                jacobian=moves,
-            ),
+            "pose_relative": steps("pose_relative", self.follows, 1.0),
+            **cuts,
             "pose_white": CostTerm(
                 residuals.pose_deviation,
                 self.slots["pose_white"],
@@ -305,8 +342,12 @@ def pose_prior(
     spacing: float,
     positioning: PositioningNoise,
     config: PosePriorConfig,
+    cut: Int[Tensor, " s"] | None = None,
 ) -> PosePrior:
-    """The prior of the poses `pose` of a bundle, whose drift stands still within `spacing` metres."""
+    """The prior of the poses `pose` of a bundle, whose drift stands still within `spacing` metres.
+
+    Drives are cut before the nodes `cut`, each of which another one of its journey is before.
+    """
     bias, drift = (
         torch.stack(part)
         for part in zip(*(_sigmas(journey, positioning, pose) for journey in journeys), strict=True)
@@ -314,11 +355,18 @@ def pose_prior(
     length = pose.new_tensor([positioning.drift_length_m] * 3 + [positioning.rotation_length_m] * 3)
     white = pose.new_tensor([positioning.white_sigma_m] * 3 + [positioning.white_sigma_rad] * 3)
     begins = torch.nonzero(_begins(nodes.journey))[:, 0]
-    follows = torch.nonzero(nodes.journey[1:] == nodes.journey[:-1])[:, 0]
+    cut = begins[:0] if cut is None else cut
+    follows = nodes.journey[1:] == nodes.journey[:-1]
+    follows[cut - 1] = False
+    follows = torch.nonzero(follows)[:, 0]
     far = nodes_apart(nodes.journey, nodes.way, config.scale_lag_m)
     every = torch.arange(len(journeys), device=pose.device)
     frame = torch.arange(len(pose), device=pose.device)
+    number = torch.arange(len(cut), device=pose.device)
+    at_cut, of_cut = ("cut", number), ("bias", nodes.journey[cut])
     slots = {
+        "pose_before_cut": (("drift", cut - 1), at_cut, of_cut),
+        "pose_behind_cut": (at_cut, ("drift", cut), of_cut),
         "pose_bias": (("bias", every),),
         "pose_absolute": (("drift", begins), ("bias", nodes.journey[begins])),
         "pose_relative": (
@@ -337,7 +385,21 @@ def pose_prior(
         wander = bias_wander(sigma, is_long, nodes.journey, nodes.way, reach)
         bias = torch.cat((torch.where(is_long[:, None], left, bias[:, :3]), bias[:, 3:]), dim=1)
     return PosePrior(
-        *(pose, nodes, spacing, bias, drift, length, white, begins, follows, far, config, slots),
+        *(
+            pose,
+            nodes,
+            spacing,
+            bias,
+            drift,
+            length,
+            white,
+            begins,
+            follows,
+            cut,
+            far,
+            config,
+            slots,
+        ),
         wander=wander,
     )
 

@@ -19,7 +19,7 @@ from crowdmap_torch.simulate.worlds import WORLD_PRESETS
 from crowdmap_torch.soak.verdict import PROGRESS
 
 QUICK = """\
-adjust: {lm: {max_iterations: 2}, covariance_samples: 2}
+adjust: {lm: {max_iterations: 2}}
 sign_triangulation: {fit: {rounds: 1, lm: {max_iterations: 4}, coarse_lm: {max_iterations: 2}}}
 crowd: {rounds: 1}
 """

@@ -41,7 +41,7 @@ STAGES = (
 WITHIN_S = 5.0
 """A signal ends a run within this time, and a run that was killed leaves nobody behind after it."""
 _CONFIG = """\
-adjust: {lm: {max_iterations: 8}, covariance_samples: 4}
+adjust: {lm: {max_iterations: 8}}
 sign_triangulation: {fit: {rounds: 1, lm: {max_iterations: 4}, coarse_lm: {max_iterations: 2}}}
 crowd: {rounds: 1}
 """

@@ -365,20 +365,20 @@ def reject_steps(monkeypatch: pytest.MonkeyPatch, numbers: tuple[int, ...]) -> N
 
 
 @pytest.mark.parametrize(
-    ("dense_unknowns", "most", "rejected"),
-    [(12000, 30, ()), (0, 3, ()), (12000, 6, (2, 3))],
-    ids=["dense", "conjugate gradients", "with rejected steps"],
+    ("cut_unknowns", "most", "rejected"),
+    [(0, 30, ()), (40, 3, ()), (0, 6, (2, 3))],
+    ids=["whole drives", "drives that are cut", "with rejected steps"],
 )
 def test_an_adjustment_cut_at_any_step_goes_on_to_the_same_bits(
     street: Street,
-    dense_unknowns: int,
+    cut_unknowns: int,
     most: int,
     rejected: tuple[int, ...],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ):
     reject_steps(monkeypatch, rejected)
-    config = AdjustConfig(dense_unknowns=dense_unknowns, frame_spacing_m=6.0)
+    config = AdjustConfig(cut_unknowns=cut_unknowns, frame_spacing_m=6.0)
     config = replace(config, lm=replace(config.lm, max_iterations=most))
     whole, kept = street.bundle(config=config), tmp_path / "step.pt"
     state = begun = adjust.start(whole)

@@ -15,29 +15,39 @@ from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.mapper import MapResult, build_bundle
+from crowdmap_torch.noise.pose_evidence import pose_evidence
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.problem import positive
-from crowdmap_torch.optim.solvers.conjugate_gradient import (
-    ConjugateGradientBackend,
-    ConjugateGradientEquations,
-)
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.tables import Dataset
 
+_CUT = 60
+"""Unknowns along a stretch of a drive that is cut: three stretches or more."""
 
-@pytest.fixture(scope="module", params=[3000.0, 60.0], ids=["short", "long"])
-def bundle(request: pytest.FixtureRequest, tiny: Dataset, tiny_result: MapResult) -> Bundle:
-    """Three journeys with a frame every six metres; the bias is one, or wanders within what was driven."""
+
+def built(tiny: Dataset, tiny_result: MapResult, *, wander_m: float, cut: int) -> Bundle:
+    """Three journeys with a frame every six metres."""
     config = MapperConfig()
     config = replace(
         config,
-        adjust=replace(config.adjust, frame_spacing_m=6.0),
-        positioning=replace(config.positioning, wander_length_m=request.param),
+        adjust=replace(config.adjust, frame_spacing_m=6.0, cut_unknowns=cut),
+        positioning=replace(config.positioning, wander_length_m=wander_m),
     )
     maps, first = tiny_result.journey_maps, tiny_result.first
-    built = build_bundle(tiny.journeys, maps, first, config)
-    adjust.start(built)
-    return built
+    bundle = build_bundle(tiny.journeys, maps, first, config)
+    adjust.start(bundle)
+    return bundle
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(3000.0, 0), (60.0, 0), (3000.0, _CUT), (60.0, _CUT)],
+    ids=["short", "long", "short and cut", "long and cut"],
+)
+def bundle(request: pytest.FixtureRequest, tiny: Dataset, tiny_result: MapResult) -> Bundle:
+    """The bias is one, or wanders within what was driven; drives are whole, or cut."""
+    wander_m, cut = request.param
+    return built(tiny, tiny_result, wander_m=wander_m, cut=cut)
 
 
 @pytest.fixture(scope="module")
@@ -162,31 +172,25 @@ def test_a_journey_without_a_say_has_no_bias(tiny: Dataset, tiny_result: MapResu
     assert (torch.linalg.eigvalsh(found.bias_covariance[[0, 2]]) > 0).all()
 
 
-def test_of_a_large_map_all_is_read_from_samples(
-    bundle: Bundle, found: MapUncertainty, dense, tiny_result: MapResult, monkeypatch
+@pytest.mark.parametrize("wander_m", [3000.0, 60.0], ids=["short", "long"])
+def test_drives_that_are_cut_are_solved_as_whole_ones(
+    tiny: Dataset, tiny_result: MapResult, wander_m: float
 ):
-    covariance, columns = dense
-    # As many as there are unknowns, and such that their covariance is the exact one.
-    root = torch.linalg.cholesky(covariance) * len(covariance) ** 0.5
-    drawn = {name: root[columns(name)] for name in bundle.names}
-    monkeypatch.setattr(bundle, "config", replace(bundle.config, dense_unknowns=0))
-    monkeypatch.setattr(ConjugateGradientEquations, "samples", lambda *_, **__: drawn)
-    sampled = map_uncertainty(bundle, tiny_result.first.signs, tiny_result.first.lanes)
-    for name in ("center", "corner", "lane_sigma", "bias", "bias_covariance"):
-        exact, other = getattr(found, name), getattr(sampled, name)
-        torch.testing.assert_close(other, exact, rtol=1e-4, atol=1e-7)
-    at = columns("sign")[:, :3]
-    over_pairs = covariance[at.T[:, None, :, None], at.T[None, :, None, :]].mean((-1, -2))
-    torch.testing.assert_close(sampled.shared, over_pairs, rtol=1e-4, atol=1e-7)
-
-
-def test_conjugate_gradients_take_the_step_of_the_factors(bundle: Bundle, monkeypatch):
-    damping = torch.tensor([1e-6], dtype=torch.float64)
-    exact = bundle.backend().assemble(bundle.problem(), bundle.values()).solve(damping)
-    monkeypatch.setattr(bundle, "config", replace(bundle.config, dense_unknowns=0))
-    backend = bundle.backend()
-    assert isinstance(backend, ConjugateGradientBackend)
-    step = backend.assemble(bundle.problem(), bundle.values()).solve(damping)
-    assert bool(step.solved)
-    for name, delta in exact.delta.items():
-        torch.testing.assert_close(step.delta[name], delta, rtol=1e-4, atol=1e-6)
+    whole, cut = (built(tiny, tiny_result, wander_m=wander_m, cut=n) for n in (0, _CUT))
+    assert len(whole.prior.cut) == 0 and len(cut.prior.cut) >= 6
+    damping = torch.tensor([1e-12], dtype=torch.float64)
+    of_whole, of_cut = (b.backend().assemble(b.problem(), b.values()) for b in (whole, cut))
+    # What is left once the states at cuts have taken the place that they would have anyway.
+    expected, found = of_whole.solve(damping), of_cut.solve(damping)
+    for name, delta in expected.delta.items():
+        if name != "cut":
+            torch.testing.assert_close(found.delta[name], delta, rtol=1e-6, atol=1e-8)
+    for name in ("pose", "drift"):
+        torch.testing.assert_close(
+            *(e.conditional_covariance(name) for e in (of_cut, of_whole)), rtol=1e-6, atol=1e-14
+        )
+    told, expected_told = (
+        pose_evidence(b.prior, e, b.prior_scale) for b, e in ((cut, of_cut), (whole, of_whole))
+    )
+    torch.testing.assert_close(told.told, expected_told.told, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(told.left, expected_told.left, rtol=1e-6, atol=1e-14)

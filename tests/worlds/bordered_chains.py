@@ -58,7 +58,8 @@ def drives(lengths=(30, 1, 17), marks=7, seed=0):
     names = {"pose": 2 * n, "drift": n, "bias": biases, "mark": marks}
     variables = {name: Variable(2, euclidean) for name in names}
     values = {name: noise(count, 2) for name, count in names.items()}
-    plan = EliminationPlan("drift", chain, "pose", carrier, "bias")
+    border = {"bias": torch.arange(len(lengths))}
+    plan = EliminationPlan("drift", chain, "pose", carrier, border)
     return Problem(variables, terms), values, plan
 
 
@@ -105,7 +106,7 @@ def shared_drives(lengths=(30, 1, 17), marks=7, seed=0):
     generator = torch.Generator().manual_seed(seed + 1)
     variables = {**problem.variables, "car": Variable(3, euclidean)}
     values = {**values, "car": torch.randn(3, 3, dtype=torch.float64, generator=generator)}
-    return Problem(variables, terms), values, replace(plan, shared={"car": car})
+    return Problem(variables, terms), values, replace(plan, border={**plan.border, "car": car[:-1]})
 
 
 def wandering_drives(lengths=(30, 1, 17), marks=7, seed=0):

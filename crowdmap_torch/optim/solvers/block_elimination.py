@@ -9,13 +9,14 @@ the store. The products of B_j W_j^T and W_j a_j are what leaves the reduced sys
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.optim.solvers.windows import Batch, Product, Round
 from crowdmap_torch.processes.threads import in_order
 
@@ -66,6 +67,40 @@ def fill_chain(
         link[neighbour[:, 0]] = square[:, :k, k:]
 
 
+def leads_of(
+    rounds: Sequence[Round], diagonal: Float[Tensor, "p k k"], link: Float[Tensor, "p k k"]
+) -> list[Lead]:
+    """What all rounds leave behind of themselves; the blocks, by place, are changed."""
+    leads = []
+    for of_round in rounds:
+        lead = lead_of(of_round, diagonal, link)
+        fill_chain(of_round, lead.square(), diagonal, link)
+        leads.append(lead)
+    return leads
+
+
+def solve_rounds(
+    rounds: Sequence[Round], leads: Sequence[Lead], rest: Float[Tensor, "p k c"]
+) -> Float[Tensor, "p k c"]:
+    """A^-1 of right-hand sides by place, forth and back through rounds, the last ones of all; `rest` is changed.
+
+    The places are counted from the first of these rounds on.
+    """
+    gone = rounds[0].place.start if rounds else 0
+    for of_round, lead in zip(rounds, leads, strict=True):
+        own = slice(of_round.place.start - gone, of_round.place.stop - gone)
+        whitened = lead.whiten @ rest[own]
+        rest[own] = whitened
+        fill = (lead.towards.mT @ whitened).view(-1, *rest.shape[1:])
+        rest.index_add_(0, of_round.neighbour.flatten() - gone, fill)
+    solution = torch.zeros_like(rest)
+    for of_round, lead in zip(reversed(rounds), reversed(leads), strict=True):
+        own = slice(of_round.place.start - gone, of_round.place.stop - gone)
+        beside = solution[of_round.neighbour - gone].flatten(1, 2)
+        solution[own] = lead.whiten.mT @ (rest[own] + lead.towards @ beside)
+    return solution
+
+
 @dataclass(frozen=True)
 class Eliminated:
     """What the elimination of a batch leaves to others."""
@@ -96,26 +131,24 @@ def eliminate(
     return Eliminated(fill, wide, scattered)
 
 
-def scatter(
-    batch: Batch, product: Float[Tensor, " ww"], system: Float[Tensor, "stride stride"]
-) -> None:
+def scatter(batch: Batch, product: Float[Tensor, " ww"], system: TileMatrix) -> None:
     """Adds the products of a batch's windows to the reduced system, in place."""
-    at = batch.columns[:, :, None] * len(system) + batch.columns[:, None]
-    system.view(-1).index_add_(0, at.flatten(), product)
+    at = system.pattern.at(batch.columns[:, :, None], batch.columns[:, None])
+    system.flat.index_add_(0, at.flatten(), product)
 
 
 class Products:
-    """Products that wait to be subtracted from the reduced system: stripe by stripe, each on one core, in order."""
+    """Products that wait to be subtracted from the reduced system: by rows of tiles, each on one core, in order."""
 
-    def __init__(self, system: Float[Tensor, "stride stride"]) -> None:
-        self._system = system
+    def __init__(self, system: TileMatrix) -> None:
+        self._tiles, self._right_side = system.tiles, system.right_side[None]
         self._waiting: dict[int, list[tuple[Product, Tensor]]] = {}
         self._held = 0
 
     def add(self, products: Iterable[tuple[int, Product]], wide: Float[Tensor, "b w gk"]) -> None:
         """Products of a batch's windows."""
-        for stripe, product in products:
-            self._waiting.setdefault(stripe, []).append((product, wide))
+        for row, product in products:
+            self._waiting.setdefault(row, []).append((product, wide))
         self._held += wide.numel()
         if self._held > _HELD:
             self.subtract()
@@ -123,16 +156,17 @@ class Products:
     def subtract(self) -> None:
         """Subtracts all that wait."""
 
-        def of_stripe(waiting: list[tuple[Product, Tensor]]) -> None:
+        def of_row(waiting: list[tuple[Product, Tensor]]) -> None:
             for product, wide in waiting:
                 of_group = wide[product.group]
-                self._system[product.here].addmm_(
+                into = self._right_side if product.tile < 0 else self._tiles[product.tile]
+                into[product.here].addmm_(
                     of_group[product.rows], of_group[product.beside].mT, alpha=-1
                 )
 
-        # The long stripes first.
-        stripes = [self._waiting[stripe] for stripe in sorted(self._waiting)]
-        for _ in in_order(of_stripe, stripes, self._system.device):
+        # The long rows first.
+        rows = [self._waiting[row] for row in sorted(self._waiting)]
+        for _ in in_order(of_row, rows, self._tiles.device):
             pass
         self._waiting, self._held = {}, 0
 

@@ -27,7 +27,6 @@ from crowdmap_torch.optim.solvers.chain_schur import (
     UNOBSERVED_FLOOR,
     ChainBackend,
     ChainNormalEquations,
-    Factor,
 )
 from crowdmap_torch.optim.solvers.landmark_covariance import LandmarkCovariance
 from crowdmap_torch.optim.solvers.layout import Layout
@@ -45,14 +44,17 @@ from crowdmap_torch.optim.solvers.plan import EliminationPlan
 class BorderedBackend:
     """Normal equations of a problem of whose plan the border goes last.
 
-    Rows of a term may touch a chain's own block of the border beside blocks of the chain, or alone; and what chains share
-    beside anything of theirs.
+    Rows of a term may touch a chain's blocks of the border beside anything of theirs, or alone.
     """
 
     def __init__(self, plan: EliminationPlan) -> None:
-        if not plan.border_names:
+        if not plan.border:
             raise ValueError("the plan has no border: ChainBackend is for chains without one")
         self._chains = ChainBackend(plan)
+
+    def prepare(self, problem: Problem, values: Values) -> None:
+        """Finds the order of elimination of such a problem, and takes the memory for it."""
+        self._chains.prepare(problem, values)
 
     def assemble(self, problem: Problem, values: Values) -> BorderedNormalEquations:
         """Normal equations at `values`."""
@@ -74,7 +76,7 @@ class BorderedNormalEquations:
     link: Float[Tensor, "e k b"]
     """Blocks of F: each eliminated block with its chain's blocks of the border's variables, one behind the other."""
     beside: Float[Tensor, "r _"]
-    """Those of the landmarks with the whole border; without columns where nothing is shared."""
+    """Those of the landmarks with the whole border."""
     hessian: Float[Tensor, "z z"]
     gradient: Float[Tensor, " z"]
 
@@ -110,8 +112,7 @@ class BorderedNormalEquations:
         right_side = self.gradient.index_add(
             0, entry.flatten(), self._by_chain(x[..., None])[..., 0].flatten()
         )
-        if self.beside.shape[1]:
-            right_side = right_side + self.beside.mT @ y
+        right_side = right_side + self.beside.mT @ y
         z = -torch.cholesky_solve(right_side[:, None], factor)[:, 0]
         change = reduced.landmarks @ z
         product = (self.link @ z[entry][structure.owner][..., None])[..., 0]
@@ -126,11 +127,7 @@ class BorderedNormalEquations:
         """Covariances of the landmarks, of the border and of sums over the chains, all else marginalised."""
         held = self.inner.covariance(floor=floor)
         reduced = self._reduced(torch.zeros_like(self.gradient))
-        border = torch.linalg.inv(reduced.T)
-        matrix = held.matrix + reduced.landmarks @ border @ reduced.landmarks.mT
-        factor = self.inner.workspace.factor
-        assert factor is not None
-        return BorderedCovariance(matrix, held.where, self, held.matrix, border, reduced, factor)
+        return BorderedCovariance(self, held, reduced)
 
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, landmarks and border known."""
@@ -155,36 +152,27 @@ class BorderedNormalEquations:
         for name, offset in self.layout.offset.items():
             own = slice(first, first + self.layout.tangent_dim[name])
             x = self.inner.solve_eliminated(self.link[..., own].contiguous())
-            block = plan.border_block(name, owner)
+            block = plan.border[name][owner]
             coupled.append(self.inner.couple(x, block, len(offset)).flatten(1))
             at = entry[:, :, None] * size + entry[:, None, own]
             T.view(-1).index_add_(0, at.flatten(), -self._by_chain(x).flatten())
             first = own.stop
         by_landmark = torch.cat(coupled, dim=1)
-        if self.beside.shape[1]:
-            by_landmark = by_landmark - self.beside
+        by_landmark = by_landmark - self.beside
         landmarks = self.inner.solve_reduced(by_landmark)
         return Reduced(T - by_landmark.mT @ landmarks, by_landmark, landmarks)
 
     def _entries(self) -> Int[Tensor, "j b"]:
         """Where in the border the blocks of every chain are."""
-        plan, layout = self.inner.structure.plan, self.layout
-        chain = torch.arange(self._chains(), device=self.gradient.device)
-        return torch.cat(
-            [layout.entries(name, plan.border_block(name, chain)) for name in layout.offset], dim=1
-        )
-
-    def _chains(self) -> int:
-        """Number of chains, those included that have no block."""
-        plan = self.inner.structure.plan
-        if plan.border is not None:
-            return len(self.layout.offset[plan.border])
-        return min(len(block) for block in plan.shared.values())
+        border = self.inner.structure.plan.border
+        parts = [self.layout.entries(name, border[name]) for name in self.layout.offset]
+        return torch.cat(parts, dim=1)
 
     def _by_chain(self, x: Float[Tensor, "e k c"]) -> Float[Tensor, "j b c"]:
         """F^T x of leaves and chains, chain by chain."""
-        total = x.new_zeros(self._chains(), self.link.shape[-1], x.shape[-1])
-        return total.index_add_(0, self.inner.structure.owner, self.link.mT @ x)
+        structure = self.inner.structure
+        total = x.new_zeros(structure.plan.chain_count, self.link.shape[-1], x.shape[-1])
+        return total.index_add_(0, structure.owner, self.link.mT @ x)
 
 
 @dataclass(frozen=True)
@@ -198,17 +186,26 @@ class Reduced:
     """S^-1 of it: the landmarks' part of K^-1 F, with the opposite sign."""
 
 
-@dataclass(frozen=True)
 class BorderedCovariance(LandmarkCovariance):
-    """The joint covariance of all landmarks; those of the border and of sums over chains are there for the asking."""
+    """The covariance of landmarks; those of the border and of sums over chains are there for the asking."""
 
-    _equations: BorderedNormalEquations
-    _held: Float[Tensor, "r r"]
-    """S^-1: the landmarks' covariance with the border held."""
-    _border: Float[Tensor, "z z"]
-    """T^-1."""
-    _reduced: Reduced
-    _factor: Factor
+    def __init__(
+        self, equations: BorderedNormalEquations, held: LandmarkCovariance, reduced: Reduced
+    ) -> None:
+        """`held` is that of the landmarks with the border held."""
+        self.where = held.where
+        self._equations, self._held, self._reduced = equations, held, reduced
+        self._border = torch.linalg.inv(reduced.T)
+
+    def entries(self, at: Int[Tensor, "n q"]) -> Float[Tensor, "n q q"]:
+        """The covariance of tangents, row by row."""
+        through = self._reduced.landmarks[at]
+        return self._held.entries(at) + through @ self._border @ through.mT
+
+    def solve(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
+        """The covariance times right-hand sides; ValueError where the factors are there no more."""
+        through = self._reduced.landmarks
+        return self._held.solve(right_side) + through @ (self._border @ (through.mT @ right_side))
 
     def of_border(self, *names: str) -> Float[Tensor, "n b b"]:
         """Joint covariance of the blocks that variables of the border have of each number, one behind the other."""
@@ -216,24 +213,22 @@ class BorderedCovariance(LandmarkCovariance):
         entry = torch.cat([layout.entries(name, slice(None)) for name in names], dim=1)
         return self._border[entry[:, :, None], entry[:, None]]
 
-    def of_chain_sums(self, weight: Float[Tensor, "n k m"]) -> Float[Tensor, "j m m"]:
-        """Covariance of `m` weighted sums over the blocks of each chain, leaves left out."""
+    def of_sums(
+        self, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
+    ) -> Float[Tensor, "j m m"]:
+        """Covariance of `m` weighted sums over chains' blocks, leaves left out; `of` says of which of them each chain is."""
         equations, inner = self._equations, self._equations.inner
-        if inner.workspace.factor is not self._factor:
-            raise ValueError(
-                "the normal equations were solved since; ask for their covariance anew"
-            )
-        j, m, owner = equations._chains(), weight.shape[-1], inner.structure.owner
+        j, m, owner = count, weight.shape[-1], inner.structure.owner
         of_leaves = weight.new_zeros(len(owner) - len(weight), *weight.shape[1:])
         full = torch.cat((of_leaves, weight))
         x = inner.solve_eliminated(full)
-        by_landmark = inner.couple(x, owner, j).flatten(1)
-        own = weight.new_zeros(j, m, m).index_add_(0, owner, full.mT @ x)
-        landmarks = self._held @ by_landmark
+        by_landmark = inner.couple(x, of[owner], j).flatten(1)
+        own = weight.new_zeros(j, m, m).index_add_(0, of[owner], full.mT @ x)
+        landmarks = self._held.solve(by_landmark)
         by_border = self._reduced.by_landmark.mT @ landmarks
-        # Of F^T x every chain's sums have the rows of its own blocks.
-        entry, sums = equations._entries(), torch.arange(j * m, device=owner.device).view(j, 1, m)
-        at = entry[..., None] * (j * m) + sums
+        # Of F^T x the sums that a chain is of have the rows of its own blocks.
+        entry, sums = equations._entries(), of[:, None] * m + torch.arange(m, device=of.device)
+        at = entry[..., None] * (j * m) + sums[:, None]
         by_border.view(-1).index_add_(0, at.flatten(), equations._by_chain(x).flatten())
         joint = torch.block_diag(*own) + by_landmark.mT @ landmarks
         joint = joint + by_border.mT @ self._border @ by_border

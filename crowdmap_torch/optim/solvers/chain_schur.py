@@ -1,4 +1,4 @@
-"""The back end for chains: leaves and chains are eliminated round by round, the landmarks are one small dense system.
+"""The back end for chains: leaves and chains are eliminated round by round, the landmarks are one system of sparse tiles.
 
 Bundle adjustment of a map has frames by the ten thousand, each bound to the next, and landmarks by the hundred: what is
 eliminated are the frames, the reverse of the usual habit. With D in A and C already, the normal equations and what is left
@@ -9,7 +9,8 @@ of them are
 
     S = C - B A^-1 B^T        S y = -(b - B A^-1 a)        x = -A^-1 (a + B^T y)
 
-the Schur complement on the landmarks, the reduced system and the back-substitution. `elimination` says in which order,
+the Schur complement on the landmarks, the reduced system and the back-substitution; of C and S the tiles count that hold
+anything (`sparse_tiles`). `elimination` says in which order,
 `chain_sums` adds the blocks up, `block_elimination` is the arithmetic of a round.
 """
 
@@ -31,11 +32,14 @@ from crowdmap_torch.optim.solvers.block_elimination import (
     eliminate,
     fill_chain,
     lead_of,
+    leads_of,
     rows_of,
     scatter,
+    solve_rounds,
 )
 from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
+from crowdmap_torch.optim.solvers.joints import joints_of
 from crowdmap_torch.optim.solvers.landmark_covariance import LandmarkCovariance
 from crowdmap_torch.optim.solvers.layout import SparsityPattern
 from crowdmap_torch.optim.solvers.normal_equations import (
@@ -48,6 +52,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 )
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.optim.solvers.windows import Batch, Round
 from crowdmap_torch.processes.threads import in_order
@@ -79,8 +84,9 @@ class ChainBackend:
 
         The workspace of the solve is the back end's: of its normal equations only the last may be solved.
         """
-        if self.plan.border is not None:
-            raise ValueError(f"the border {self.plan.border!r} is for BorderedBackend to eliminate")
+        if self.plan.border:
+            names = ", ".join(self.plan.border)
+            raise ValueError(f"the border, {names}, is for BorderedBackend to eliminate")
         return self.assemble_with_border(problem, values)[0]
 
     def assemble_with_border(
@@ -130,8 +136,8 @@ class ChainBackend:
 class Workspace:
     """What the solves of one back end share: memory is taken once."""
 
-    system: Float[Tensor, "s s"]
-    """Matrix of the reduced system, upper triangle; one row more for its right-hand side, one for padding."""
+    system: TileMatrix
+    """The reduced system."""
     store: Float[Tensor, "rows k"]
     """Per eliminated block and column of its window a row of `k`, by when it is eliminated."""
     couplings: dict[str, Float[Tensor, "f w _"]] = field(default_factory=dict)
@@ -142,8 +148,8 @@ class Workspace:
     @classmethod
     def of(cls, structure: ChainStructure, like: Tensor, k: int) -> Workspace:
         """Memory for eliminated blocks of `k` unknowns, with the device and the type of `like`."""
-        dim = structure.where.dim + 2
-        return cls(like.new_zeros(dim, dim), like.new_empty(structure.store_rows + 1, k))
+        store = like.new_empty(structure.store_rows + 1, k)
+        return cls(TileMatrix.zeros(structure.reduced, like), store)
 
     def coupling(self, name: str, shape: tuple[int, ...]) -> Float[Tensor, "f w _"]:
         """Memory for a term's coupling; what is in it is of no account."""
@@ -175,7 +181,7 @@ class ChainNormalEquations:
     eliminated_gradient: Float[Tensor, "e k"]
     coupling: Mapping[str, Float[Tensor, "f w _"]]
     """Blocks of B by term, as wide as the eliminated variable."""
-    hessian: Float[Tensor, "r r"]
+    hessian: TileMatrix
     gradient: Float[Tensor, " r"]
     workspace: Workspace = field(repr=False)
 
@@ -219,19 +225,36 @@ class ChainNormalEquations:
         nothing = torch.zeros_like(self.eliminated_gradient)
         if self.factorise(nothing, torch.full_like(self.gradient, floor)) is None:
             raise ValueError("the chains' blocks are not positive definite without damping")
-        assert self.workspace.factor is not None
-        return LandmarkCovariance(self.workspace.factor.reduced.inverse(), self.structure.where)
+        workspace, factor = self.workspace, self.workspace.factor
+        assert factor is not None
+        return LandmarkCovariance(
+            factor.reduced, self.structure.where, lambda: workspace.factor is factor
+        )
 
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, the landmarks known."""
-        found = diagonal_of_inverse(self.structure, self.diagonal, self.link)
+        found = self._diagonal_of_inverse()
         return self.structure.unstack(found)[name][..., : self.structure.width[name]]
+
+    def _diagonal_of_inverse(self) -> Float[Tensor, "e k k"]:
+        """Covariance of every eliminated block, the landmarks known but for the joints of chains."""
+        structure = self.structure
+        found = diagonal_of_inverse(structure, self.diagonal, self.link)
+
+        def solve(right_side: Float[Tensor, "e k c"]) -> Float[Tensor, "e k c"]:
+            blocks = structure.by_place(self.diagonal, self.link)
+            return self._solve_with(leads_of(structure.rounds, *blocks), right_side)
+
+        joints = joints_of(structure, self.coupling, self.hessian, solve)
+        if joints is not None:
+            found += joints.of_blocks(torch.arange(len(found), device=found.device))
+        return found
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
         """Variance of each leaf's numbers less those of the block that carries it, landmarks and border known."""
         plan = self.structure.plan
         assert plan.carrier is not None
-        found = diagonal_of_inverse(self.structure, self.diagonal, self.link)
+        found = self._diagonal_of_inverse()
         of_carrier = found[plan.leaf_count :][plan.carrier]
         alone = torch.linalg.inv(self.diagonal[: plan.leaf_count])
         # The leaf goes with its carrier by -H^-1 times their link.
@@ -252,6 +275,9 @@ class ChainNormalEquations:
             right_side[first], right_side[second] = -of, of
             found = self.solve_chains(right_side)
             variance[here] = (of * (found[second] - found[first])).sum(1)
+        joints = joints_of(self.structure, self.coupling, self.hessian, self.solve_eliminated)
+        if joints is not None:
+            variance += joints.of_changes(changes, self.structure.plan.leaf_count)
         return variance
 
     def factorise(
@@ -272,11 +298,10 @@ class ChainNormalEquations:
             else:
                 narrow.index_add_(0, rows, block)
         store[structure.right_side_row] = self.eliminated_gradient
-        dim = len(self.gradient)
         system = self.workspace.system
-        system[:dim, :dim] = self.hessian
-        system[dim, :dim] = self.gradient
-        system.diagonal()[:dim].add_(added_y)
+        system.copy_from(self.hessian, structure.direct_tiles)
+        system.right_side.copy_(self.gradient)
+        system.add_diagonal(added_y)
         diagonal, link = structure.by_place(self.diagonal + torch.diag_embed(added_x), self.link)
         leads, products = [], Products(system)
         for of_round in structure.rounds:
@@ -297,11 +322,11 @@ class ChainNormalEquations:
                     products.add(batch.products, part.wide)
         products.subtract()
         # What is not positive definite on the way gives numbers that are not finite, and the factors none either.
-        reduced = TiledCholesky.of(system[:dim, :dim])
+        reduced = TiledCholesky.of(system)
         if reduced is None:
             return None
         self.workspace.factor = Factor(leads, reduced)
-        return system[dim, :dim]
+        return system.right_side
 
     def solve_reduced(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
         """S^-1 of right-hand sides, by the last factors."""
@@ -313,10 +338,16 @@ class ChainNormalEquations:
 
         Chains do not touch each other in A: one column serves as many right-hand sides as there are chains.
         """
+        assert self.workspace.factor is not None
+        return self._solve_with(self.workspace.factor.leads, right_side)
+
+    def _solve_with(
+        self, leads: list[Lead], right_side: Float[Tensor, "e k c"]
+    ) -> Float[Tensor, "e k c"]:
         place = self.structure.place
         rest = right_side.new_zeros(len(self.structure.order), *right_side.shape[1:])
         rest[place] = right_side
-        return self._solve_rounds(rest, 0)[place]
+        return solve_rounds(self.structure.rounds, leads, rest)[place]
 
     def solve_chains(self, right_side: Float[Tensor, "n k c"]) -> Float[Tensor, "n k c"]:
         """The same of the chains' blocks alone, the leaves marginalised."""
@@ -327,26 +358,9 @@ class ChainNormalEquations:
         place = structure.place[structure.plan.leaf_count :] - gone
         rest = right_side.new_zeros(len(structure.order) - gone, *right_side.shape[1:])
         rest[place] = right_side
-        return self._solve_rounds(rest, begun)[place]
-
-    def _solve_rounds(self, rest: Float[Tensor, "p k c"], begun: int) -> Float[Tensor, "p k c"]:
-        """Forth and back through the rounds from number `begun` on; what is handed in is changed."""
-        factor = self.workspace.factor
-        assert factor is not None
-        steps = list(zip(self.structure.rounds, factor.leads, strict=True))[begun:]
-        gone = len(self.structure.order) - len(rest)
-        for of_round, lead in steps:
-            own = slice(of_round.place.start - gone, of_round.place.stop - gone)
-            whitened = lead.whiten @ rest[own]
-            rest[own] = whitened
-            fill = (lead.towards.mT @ whitened).view(-1, *rest.shape[1:])
-            rest.index_add_(0, of_round.neighbour.flatten() - gone, fill)
-        solution = torch.zeros_like(rest)
-        for of_round, lead in reversed(steps):
-            own = slice(of_round.place.start - gone, of_round.place.stop - gone)
-            beside = solution[of_round.neighbour - gone].flatten(1, 2)
-            solution[own] = lead.whiten.mT @ (rest[own] + lead.towards @ beside)
-        return solution
+        assert self.workspace.factor is not None
+        leads = self.workspace.factor.leads[begun:]
+        return solve_rounds(structure.rounds[begun:], leads, rest)[place]
 
     def couple(
         self, x: Float[Tensor, "e k c"], column: Int[Tensor, " e"], columns: int
@@ -423,7 +437,7 @@ def chain_equations(
         link=link,
         eliminated_gradient=gradient,
         coupling={},
-        hessian=nothing.view(0, 0),
+        hessian=TileMatrix.zeros(structure.direct, nothing),
         gradient=nothing,
         workspace=Workspace.of(structure, gradient, gradient.shape[1]),
     )

@@ -12,6 +12,7 @@ from crowdmap_torch.optim.linearize import RowBlocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, add_blocks, pairs
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, Coupling, padded
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 
 
 class ChainSums:
@@ -26,7 +27,7 @@ class ChainSums:
         """Block of A of each chain's block with its successor, of each leaf with the block that carries it."""
         self.border = {
             name: like.new_zeros(len(structure.owner), k, problem.variables[name].tangent_dim)
-            for name in plan.border_names
+            for name in plan.border
         }
         """Block of each with its chain's block of every variable of the border."""
 
@@ -96,10 +97,9 @@ class ReducibleSums(ChainSums):
         super().__init__(structure, problem, values)
         dim, like = structure.where.dim, values[structure.plan.chains]
         self.coupling = coupling
-        self._matrix = like.new_zeros(dim, dim)
-        shared = structure.border.dim if structure.plan.shared else 0
-        self.beside = like.new_zeros(dim, shared)
-        """Blocks between landmarks and the border, where the border is shared; else nothing."""
+        self._matrix = TileMatrix.zeros(structure.direct, like)
+        self.beside = like.new_zeros(dim, structure.border.dim)
+        """Blocks between landmarks and the border."""
         self._among = like.new_zeros(structure.border.dim, structure.border.dim)
         for name, blocks in coupling.items():
             if structure.couplings[name].factor_of_row is not None:
@@ -114,8 +114,8 @@ class ReducibleSums(ChainSums):
             square = chunk.blocks.hessian[i, j]
             if name in where.offset and other in where.offset:
                 row, column = where.offset[name][block], where.offset[other][block_of_other]
-                add_blocks(self._matrix.view(-1), row, column, where.dim, square)
-                add_blocks(self._matrix.view(-1), column, row, where.dim, square.transpose(0, 1))
+                self._matrix.add(row, column, square)
+                self._matrix.add(column, row, square.transpose(0, 1))
             elif name in where.offset and other in border.offset:
                 row, column = where.offset[name][block], border.offset[other][block_of_other]
                 add_blocks(self.beside.view(-1), row, column, border.dim, square)
@@ -131,12 +131,12 @@ class ReducibleSums(ChainSums):
             coupling = self.structure.couplings[chunk.term]
             _add_coupling(self.coupling[chunk.term], coupling, chunk, set(border.offset))
 
-    def landmark_hessian(self) -> Float[Tensor, "r r"]:
+    def landmark_hessian(self) -> TileMatrix:
         """The matrix C."""
         where = self.structure.where
         for name, offset in where.offset.items():
             square = self.by_variable.hessian(name).permute(1, 2, 0)
-            add_blocks(self._matrix.view(-1), offset, offset, where.dim, square)
+            self._matrix.add(offset, offset, square)
         return self._matrix
 
     def border_hessian(self) -> Float[Tensor, "z z"]:

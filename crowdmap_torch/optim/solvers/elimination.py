@@ -20,15 +20,22 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values
+from crowdmap_torch.optim.solvers.dissection import dissected, incidence, near_each_other
 from crowdmap_torch.optim.solvers.layout import Layout, layout
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern
+from crowdmap_torch.optim.solvers.tile_patterns import (
+    binds,
+    direct_pattern,
+    landmark_pairs,
+    reduced_pattern,
+)
 from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, Round, WindowBuilder
 
 
@@ -77,6 +84,12 @@ class ChainStructure:
     store_rows: int
     """Rows of the store; one more takes what is to be forgotten."""
     rounds: tuple[Round, ...]
+    direct: TilePattern
+    """Tiles of C."""
+    reduced: TilePattern
+    """Tiles of S and of its factor."""
+    direct_tiles: Int[Tensor, " count"]
+    """The numbers of C's tiles among those of S."""
     owner: Int[Tensor, " e"]
     """Chain that each block belongs to, counted over leaves and chains."""
     border: Layout
@@ -142,29 +155,33 @@ def analyse(
     It depends on the plan and on what the rows touch now, not on what they touched before.
 
     Every row may touch one eliminated block and any landmarks; or one or two eliminated blocks, neighbours of a chain or a
-    leaf and the block that carries it. Beside them it may touch the chain's own block of the border, unless it touches
-    landmarks, and the blocks that its chain shares.
+    leaf and the block that carries it. Beside them it may touch the chain's blocks of the border.
     """
     where, landmarks, couplings, keys = _touched(problem, values, plan)
     if plan.room is not None:
         fits = bool(torch.isin(keys, plan.room, assume_unique=True).all())
         keys = plan.room if fits else torch.unique(torch.cat((plan.room, keys)))
     if before is not None and torch.equal(keys, before.keys):
-        return before.with_couplings(couplings)
-    rank = _rank(keys, landmarks) if plan.rank is None else plan.rank
+        pairs = landmark_pairs(problem, before.landmarks, plan.first_block)
+        if binds(before.direct, before.landmarks, pairs):
+            return before.with_couplings(couplings)
+    pairs, rank = landmark_pairs(problem, landmarks, plan.first_block), plan.rank
+    if rank is None:
+        rank = _rank(keys, pairs, plan.owner, landmarks)
     where = where.in_order(torch.argsort(rank[: len(landmarks.column)], stable=True))
     landmarks = LandmarkBlocks.of(where, plan.chain.device)
     owner = plan.owner
     k = problem.variables[plan.chains].tangent_dim
     if plan.leaves is not None and problem.variables[plan.leaves].tangent_dim > k:
         raise ValueError(f"{plan.leaves!r}: expected leaves of at most {k} tangents, the chains'")
-    # About as many as there are drives: those that see one stretch of road at the same step.
-    size = group_size or min(64, max(4, plan.chain_count))
+    size = group_size or min(64, max(4, _beside_each_other(keys, owner, landmarks.count)))
     builder = WindowBuilder(landmarks, len(owner), size, k, batch_bytes)
     windows = [
         builder.windows(node, neighbour, coupled)
         for node, neighbour, coupled in _rounds(keys, plan, landmarks.count)
     ]
+    direct = direct_pattern(landmarks, keys, pairs)
+    reduced = reduced_pattern(direct, landmarks, *builder.bound())
     places = [table.flatten() for _, _, batches in windows for table, *_ in batches]
     order = torch.cat((*places, owner.new_full((1,), len(owner))))
     place = torch.full((len(owner) + 1,), len(order) - 1, device=owner.device)
@@ -176,19 +193,28 @@ def analyse(
         width={name: problem.variables[name].tangent_dim for name in plan.first_block},
         where=where,
         couplings=couplings,
-        rounds=tuple(builder.round(*of_round, place) for of_round in windows),
+        rounds=tuple(builder.round(*of_round, place, reduced) for of_round in windows),
         factor_rows=factor_rows,
         alone=_alone(factor_rows, builder.store_rows),
         order=order,
         place=place[:-1],
         right_side_row=builder.first_row[:-1],
         store_rows=builder.store_rows,
+        direct=direct,
+        reduced=reduced,
+        direct_tiles=reduced.numbers_of(direct),
         owner=owner,
-        border=layout(problem, values, skip=_all_but(problem, plan.border_names)),
+        border=layout(problem, values, skip=_all_but(problem, plan.border)),
         keys=keys,
         landmarks=landmarks,
         windows=builder,
     )
+
+
+def _beside_each_other(keys: Int[Tensor, " keys"], owner: Int[Tensor, " e"], count: int) -> int:
+    """About how many chains are coupled to one landmark: those that see one stretch of road at the same step."""
+    own = torch.unique(owner[keys // count] * count + keys % count) % count
+    return round(len(own) / max(len(torch.unique(own)), 1))
 
 
 def _placed(
@@ -224,6 +250,7 @@ def planned_ahead(
     for rows that go over to the next landmark, by number, of the `sliding` variables.
     """
     _, landmarks, _, keys = _touched(problem, values, plan)
+    pairs = landmark_pairs(problem, landmarks, plan.first_block)
     room, count = [keys], landmarks.count
     for name in sliding:
         first, number = landmarks.first[name], len(values[name])
@@ -231,14 +258,16 @@ def planned_ahead(
         for step in (-1, 1):
             goes = (at >= 0) & (at < number) & (at + step >= 0) & (at + step < number)
             room.append(keys[goes] + step)
-    return replace(plan, rank=_rank(keys, landmarks), room=torch.unique(torch.cat(room)))
+    return replace(
+        plan, rank=_rank(keys, pairs, plan.owner, landmarks), room=torch.unique(torch.cat(room))
+    )
 
 
 def _touched(
     problem: Problem, values: Values, plan: EliminationPlan
 ) -> tuple[Layout, LandmarkBlocks, dict[str, Coupling], Int[Tensor, " keys"]]:
     """The reduced system, its blocks, and what of it the eliminated blocks are coupled to, by term and as keys."""
-    where = layout(problem, values, skip=(*plan.first_block, *plan.border_names))
+    where = layout(problem, values, skip=(*plan.first_block, *plan.border))
     landmarks = LandmarkBlocks.of(where, plan.chain.device)
     couplings = _couplings(problem.terms, plan, plan.owner, landmarks)
     return where, landmarks, couplings, _coupled_landmarks(couplings, landmarks)
@@ -255,24 +284,18 @@ def _couplings(
     first_block, couplings = plan.first_block, {}
     for name, term in terms.items():
         eliminated = [i for i, (slot, _) in enumerate(term.slots) if slot in first_block]
-        border = [i for i, (slot, _) in enumerate(term.slots) if slot in plan.border_names]
-        own = [i for i in border if term.slots[i][0] == plan.border]
+        border = [i for i, (slot, _) in enumerate(term.slots) if slot in plan.border]
         others = len(term.slots) - len(eliminated) - len(border)
         if len(eliminated) > 2 or (others and len(eliminated) > 1):
             raise ValueError(
                 f"term {name!r} couples {len(eliminated)} eliminated blocks and {others} others; "
                 "at most two eliminated blocks are supported, and one with landmarks"
             )
-        if (others and own) or len(own) > 1:
-            raise ValueError(
-                f"term {name!r} couples a block of the border {plan.border!r} with landmarks or "
-                "another one; only its own chain's blocks are supported"
-            )
         for i in eliminated:
             slot, block = term.slots[i]
             chain = owner[block + first_block[slot]]
             for beside, its_block in (term.slots[k] for k in border):
-                if not torch.equal(plan.border_block(beside, chain), its_block):
+                if not torch.equal(plan.border[beside][chain], its_block):
                     raise ValueError(
                         f"term {name!r} couples blocks of {slot!r} with the {beside!r} of another chain"
                     )
@@ -324,17 +347,26 @@ def _coupled_landmarks(
     return torch.unique(torch.cat([none, *keys]))
 
 
-def _rank(keys: Int[Tensor, " keys"], landmarks: LandmarkBlocks) -> Float[Tensor, " q"]:
-    """A position of every landmark on a line, by couplings as keys."""
+def _rank(
+    keys: Int[Tensor, " keys"],
+    pairs: Int[Tensor, "n 2"],
+    owner: Int[Tensor, " e"],
+    landmarks: LandmarkBlocks,
+) -> Float[Tensor, " q"]:
+    """A position of every landmark on a line, by couplings as keys and pairs that are bound without an eliminated block."""
     count = landmarks.count
+    block, column = keys // count, (keys % count).cpu().numpy()
     # Blocks of a chain are coupled to nearly what their neighbours are: a few of them together tell the same.
-    row, column = (keys // count // 8).cpu().numpy(), (keys % count).cpu().numpy()
-    rows = int(row.max()) + 1 if len(row) else 1
-    coupled = coo_matrix((torch.ones(len(row)).numpy(), (row, column)), shape=(rows, count)).tocsr()
-    order = reverse_cuthill_mckee((coupled.T @ coupled).tocsr(), symmetric_mode=True)
-    rank = torch.empty(count, dtype=torch.double)
-    rank[torch.from_numpy(order.astype("int64"))] = torch.arange(count, dtype=torch.double)
-    return rank.to(keys.device)
+    position = near_each_other(incidence((block // 8).cpu().numpy(), column, count))
+    # Once it is eliminated, a chain has bound all that it was coupled to.
+    first = int(owner.max()) + 1 if len(owner) else 0
+    apart = torch.arange(first, first + len(pairs)).repeat_interleave(2)
+    row = torch.cat((owner[block].cpu(), apart)).numpy()
+    bound = incidence(row, np.concatenate((column, pairs.flatten().cpu().numpy())), count)
+    width = landmarks.width.cpu().numpy()
+    if not len(width):
+        return torch.zeros(count, dtype=torch.double, device=keys.device)
+    return torch.from_numpy(dissected(bound, width, position)).double().to(keys.device)
 
 
 def _rounds(

@@ -136,8 +136,10 @@ class MapCovariance(Covariance, Protocol):
         """Covariance of every block of what drives have to themselves or share, of several such variables jointly."""
         ...
 
-    def of_chain_sums(self, weight: Float[Tensor, "n k m"]) -> Float[Tensor, "j m m"]:
-        """Covariance of `m` weighted sums over each chain's own blocks."""
+    def of_sums(
+        self, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
+    ) -> Float[Tensor, "j m m"]:
+        """Covariance of `m` weighted sums over chains' blocks; `of` says of which of them each chain is."""
         ...
 
 

@@ -14,8 +14,8 @@ from torch import Tensor
 class EliminationPlan:
     """Leaves go first, then the chains they hang on; what is not named are landmarks, solved for together; the border last.
 
-    A frame's pose is a leaf on the drift of its journey, the drift of a journey is a chain, and the journey's bias its
-    block of the border, as is the calibration of the car that it shares with others. Chains touch each other through
+    A frame's pose is a leaf on the drift of its journey, the drift of a journey, or of a stretch of it, is a chain, and the
+    journey's bias and the calibration of its car are its blocks of the border. Chains touch each other through
     landmarks and through what they share, and through nothing else.
     """
 
@@ -27,10 +27,12 @@ class EliminationPlan:
     """Variable whose blocks are bound to one block of a chain each; None: there is none."""
     carrier: Int[Tensor, " m"] | None = None
     """Block of the chains that each leaf hangs on."""
-    border: str | None = None
-    """Variable of which each chain has a block of its own, that of its number; None: there is none."""
-    shared: Mapping[str, Int[Tensor, " j"]] = field(default_factory=dict)
-    """Variables of the border that several chains have one block of in common, by name: the block of each chain."""
+    border: Mapping[str, Int[Tensor, " chains"]] = field(default_factory=dict)
+    """Variables of which each chain has one block, to itself or in common with others, by name: the block of each chain."""
+    joints: str | None = None
+    """Variable of the landmarks at whose blocks chains of one drive are joined, in their order; None: there is none."""
+    joint: Int[Tensor, "chains 2"] | None = None
+    """The block that each chain begins at and the one that it ends at; -1: it does not."""
     rank: Float[Tensor, " q"] | None = None
     """A position of every landmark on a line (`planned_ahead`); None: found whenever rows touch other landmarks."""
     room: Int[Tensor, " keys"] | None = None
@@ -54,17 +56,8 @@ class EliminationPlan:
 
     @property
     def chain_count(self) -> int:
-        """Number of chains that have a block."""
+        """Number of chains."""
         return len(torch.unique(self.chain))
-
-    @property
-    def border_names(self) -> tuple[str, ...]:
-        """The border's variables."""
-        return (*(() if self.border is None else (self.border,)), *self.shared)
-
-    def border_block(self, name: str, chain: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
-        """The block of a variable of the border that chains have."""
-        return self.shared[name][chain] if name in self.shared else chain
 
     @property
     def leaf_count(self) -> int:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.block_elimination import fill_chain, lead_of
+from crowdmap_torch.optim.solvers.block_elimination import leads_of
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 
 
@@ -24,16 +24,12 @@ def diagonal_of_inverse(
     """Diagonal blocks of the inverse of A."""
     k = diagonal.shape[-1]
     at_place, links = structure.by_place(diagonal, link)
-    steps = []
-    for of_round in structure.rounds:
-        lead = lead_of(of_round, at_place, links)
-        fill_chain(of_round, lead.square(), at_place, links)
-        inverse, towards = lead.whiten.mT @ lead.whiten, lead.whiten.mT @ lead.towards
-        steps.append((of_round, inverse, towards))
+    leads = leads_of(structure.rounds, at_place, links)
     found = diagonal.new_zeros(len(structure.order), k, k)
     # With the block that follows, of those known so far.
     crossed = torch.zeros_like(found)
-    for of_round, inverse, towards in reversed(steps):
+    for of_round, lead in zip(reversed(structure.rounds), reversed(leads), strict=True):
+        inverse, towards = lead.whiten.mT @ lead.whiten, lead.whiten.mT @ lead.towards
         around = found[of_round.neighbour]
         if of_round.neighbour.shape[1] == 2:
             before = of_round.neighbour[:, 0]

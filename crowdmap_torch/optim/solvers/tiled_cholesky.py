@@ -1,8 +1,12 @@
-"""Cholesky factors of one large symmetric matrix, in place and tile by tile: the tiles of a row side by side.
+"""Cholesky factors of one large symmetric matrix by its tiles, in place; and as much of its inverse as it has tiles.
 
-A = U^T U, with the rows k of tiles from top to bottom:
+A = U^T U, with the rows k of tiles from top to bottom, and each taken off those below it that it touches:
 
-    U_kk^T U_kk = A_kk - sum_i<k U_ik^T U_ik        U_kj = U_kk^-T (A_kj - sum_i<k U_ik^T U_ij)
+    U_kk^T U_kk = A_kk        U_kj = U_kk^-T A_kj        A_ij -= U_ki^T U_kj        for k < i <= j
+
+Of the inverse Z the tiles that the factor has follow from each other, from bottom to top (Takahashi, Fagan and Chen 1973):
+
+    G_j = U_kk^-1 U_kj        Z_kj = -sum_i G_i Z_ij        Z_kk = U_kk^-1 U_kk^-T - sum_j Z_kj G_j^T
 
 Where the tiles end does not depend on the number of cores, nor do the bits of the factors.
 """
@@ -15,87 +19,86 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.processes.threads import in_order
-
-_WORTH_TILES = 768
-"""Unknowns from which tiles pay."""
-_TILE = 192
-_SIDE_BY_SIDE = 8
-"""Pieces that a row of tiles is cut into."""
 
 
 @dataclass(frozen=True)
 class TiledCholesky:
     """The factors of a matrix, and what is solved with them."""
 
-    upper: Float[Tensor, "r r"]
+    upper: TileMatrix
     """U; below its diagonal anything may stand."""
 
     @classmethod
-    def of(cls, matrix: Float[Tensor, "r r"]) -> TiledCholesky | None:
-        """Those of a matrix of which the upper triangle counts, and which is no more; None: it is not positive definite."""
-        if not _by_tiles(matrix):
-            upper, failed = torch.linalg.cholesky_ex(matrix, upper=True)
-            # What is not a number on the way is none down to the last pivot.
-            failed = bool(failed) or not bool(upper.diagonal().isfinite().all())
-            return None if failed else cls(upper)
-        for here, before, behind in _tiles(len(matrix)):
-            above = matrix[before, here].mT
-            own = matrix[here, here].addmm_(above, above.mT, alpha=-1)
+    def of(cls, matrix: TileMatrix) -> TiledCholesky | None:
+        """Those of a matrix with all tiles of its factor, which is no more; None: it is not positive definite."""
+        pattern, tiles = matrix.pattern, matrix.tiles
+        number, failures = pattern.number, []
+        for k, right in enumerate(pattern.columns):
+            own = tiles[number[k][k]]
             factor, failed = torch.linalg.cholesky_ex(own, upper=True)
-            if int(failed) or not bool(factor.diagonal().isfinite().all()):
-                return None
+            failures.append(failed)
             own.copy_(factor)
-            _finish_row(matrix, here, before, behind, factor)
+
+            def whiten(j: int, k: int = k, factor: Tensor = factor) -> None:
+                tile = tiles[number[k][j]]
+                tile.copy_(torch.linalg.solve_triangular(factor.mT, tile, upper=False))
+
+            def take_off(at: int, k: int = k, right: tuple[int, ...] = right) -> None:
+                i = right[at]
+                of_i = tiles[number[k][i]].mT
+                for j in right[at:]:
+                    tiles[number[i][j]].addmm_(of_i, tiles[number[k][j]], alpha=-1)
+
+            for _ in in_order(whiten, right, tiles.device):
+                pass
+            for _ in in_order(take_off, range(len(right)), tiles.device):
+                pass
+        # What is not a number on the way is none down to the last pivot.
+        finite = tiles[pattern.own].diagonal(dim1=-2, dim2=-1).isfinite().all()
+        if failures and bool(torch.stack(failures).any() | ~finite):
+            return None
         return cls(matrix)
 
     def solve(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
         """The inverse times right-hand sides."""
-        U = self.upper
-        if not _by_tiles(U):
-            return torch.cholesky_solve(right_side, U, upper=True)
-        x = right_side.clone()
-        tiles = list(_tiles(len(U)))
-        for here, before, _ in tiles:
-            x[here].addmm_(U[before, here].mT, x[before], alpha=-1)
-            x[here] = torch.linalg.solve_triangular(U[here, here].mT, x[here], upper=False)
-        for here, _, behind in reversed(tiles):
-            x[here].addmm_(U[here, behind], x[behind], alpha=-1)
-            x[here] = torch.linalg.solve_triangular(U[here, here], x[here], upper=True)
-        return x
+        pattern, tiles = self.upper.pattern, self.upper.tiles
+        number, w = pattern.number, pattern.width
+        x = right_side.new_zeros(pattern.tiles, w, right_side.shape[1])
+        x.view(-1, right_side.shape[1])[: pattern.dim] = right_side
+        for k, right in enumerate(pattern.columns):
+            x[k] = torch.linalg.solve_triangular(tiles[number[k][k]].mT, x[k], upper=False)
+            for j in right:
+                x[j].addmm_(tiles[number[k][j]].mT, x[k], alpha=-1)
+        for k, right in reversed(list(enumerate(pattern.columns))):
+            for j in right:
+                x[k].addmm_(tiles[number[k][j]], x[j], alpha=-1)
+            x[k] = torch.linalg.solve_triangular(tiles[number[k][k]], x[k], upper=True)
+        return x.view(-1, right_side.shape[1])[: pattern.dim].contiguous()
 
-    def inverse(self) -> Float[Tensor, "r r"]:
-        """The inverse."""
-        return torch.cholesky_inverse(self.upper, upper=True)
+    def selected_inverse(self) -> TileMatrix:
+        """The inverse where the factor has tiles."""
+        pattern, tiles = self.upper.pattern, self.upper.tiles
+        number = pattern.number
+        inverse = TileMatrix.zeros(pattern, self.upper.flat)
+        found = inverse.tiles
+        eye = torch.eye(pattern.width).to(tiles)
+        for k, right in reversed(list(enumerate(pattern.columns))):
+            factor = tiles[number[k][k]]
+            back = torch.linalg.solve_triangular(factor, eye, upper=True)
+            lead = {j: back @ tiles[number[k][j]] for j in right}
 
+            def beside(j: int, k: int = k, lead: dict[int, Tensor] = lead) -> None:
+                tile = found[number[k][j]]
+                for i, of_i in lead.items():
+                    other = found[number[i][j]] if i <= j else found[number[j][i]].mT
+                    tile.addmm_(of_i, other, alpha=-1)
 
-def _by_tiles(matrix: Float[Tensor, "r r"]) -> bool:
-    """Whether a matrix is large enough, and on a processor."""
-    return len(matrix) >= _WORTH_TILES and matrix.device.type == "cpu"
-
-
-def _tiles(dim: int) -> list[tuple[slice, slice, slice]]:
-    """A tile's rows, those before it and those behind it."""
-    return [
-        (slice(at, min(at + _TILE, dim)), slice(0, at), slice(min(at + _TILE, dim), dim))
-        for at in range(0, dim, _TILE)
-    ]
-
-
-def _finish_row(
-    matrix: Float[Tensor, "r r"], here: slice, before: slice, behind: slice, factor: Tensor
-) -> None:
-    """The tiles beside the diagonal's, in place."""
-    width = behind.stop - behind.start
-    if not width:
-        return
-    size = max(_TILE // 2, -(-width // _SIDE_BY_SIDE))
-
-    def finish(at: int) -> None:
-        there = slice(at, min(at + size, behind.stop))
-        part = matrix[here, there]
-        part.addmm_(matrix[before, here].mT, matrix[before, there], alpha=-1)
-        part.copy_(torch.linalg.solve_triangular(factor.mT, part, upper=False))
-
-    for _ in in_order(finish, range(behind.start, behind.stop, size), matrix.device):
-        pass
+            for _ in in_order(beside, right, tiles.device):
+                pass
+            own = found[number[k][k]]
+            torch.mm(back, back.mT, out=own)
+            for j in right:
+                own.addmm_(found[number[k][j]], lead[j].mT, alpha=-1)
+        return inverse

@@ -6,29 +6,30 @@ Groups of the same width are computed together, in batches of bounded size. The 
 its window, and is as wide as a block; batch follows batch in it.
 
 Landmarks that are seen together have columns near each other. Where a window is wide and of few runs of columns, a processor
-subtracts its products from the reduced system in place, run by run, above the diagonal alone; else they are scattered.
+subtracts its products from the tiles in place, run by run, above the diagonal alone; else they are scattered.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.solvers.layout import Layout
+from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern
 
 _WORTH_RUNS = 160
 """Width from which a window's products are worth a call for each pair of its runs."""
 _RUN = 64
 """Mean length of runs from which they are worth it too."""
+_APART = 0.25
+"""Blocks whose windows begin further apart than this share of their width are not in one group."""
 _GAP = 2
 """Landmarks that are taken into a window to join two runs of columns, at most."""
-_STRIPES = 12
-"""Stripes that the reduced system is cut into, about: runs end where they do, so that each has a row of products."""
 
 
 class Product(NamedTuple):
@@ -39,8 +40,10 @@ class Product(NamedTuple):
     rows: slice
     beside: slice
     """Rows of the window, the others of them."""
+    tile: int
+    """Number of the tile of the reduced system that they leave; -1: its right-hand side."""
     here: tuple[slice, slice]
-    """The part of the reduced system, as its rows and columns."""
+    """The part of the tile, as its rows and columns."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Batch:
     first_row: int
     """Where the batch's rows begin in the store."""
     products: tuple[tuple[int, Product], ...] | None
-    """The stripe and the product of every pair of runs; None: they are scattered."""
+    """The row of tiles and the product of every pair of runs; None: they are scattered."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,6 @@ class WindowBuilder:
         self.window_places: list[Tensor] = []
         ordered = self.landmarks.ordered
         self.landmark_of = torch.repeat_interleave(ordered, self.landmarks.width[ordered])
-        self.stripe = min(256, max(96, self.landmarks.dim // _STRIPES))
         self._keys = self._places = torch.zeros(0, dtype=torch.long, device=device)
 
     def windows(
@@ -161,18 +163,10 @@ class WindowBuilder:
         block, landmark = place[keys // count], keys % count
         width = torch.zeros(len(node), dtype=torch.double, device=device)
         width.index_add_(0, block, self.landmarks.width[landmark].double())
-        position = torch.zeros_like(width).index_add_(
-            0, block, (self.landmarks.position[landmark] * self.landmarks.width[landmark]).double()
-        ) / width.clamp_min(1)
-        # Blocks that see lanes have windows several times as wide as those that see signs alone: keep them apart.
-        wide = width > width.mean()
-        order = torch.argsort(position + wide * (count + 1), stable=True)
-        group_count = -(-len(node) // self.group_size)
-        size = -(-len(node) // group_count)
-        table = torch.full((group_count * size,), self.n, dtype=torch.long, device=device)
-        table[: len(node)] = node[order]
-        group = torch.empty(len(node), dtype=torch.long, device=device)
-        group[order] = torch.arange(len(node), device=device) // size
+        first = torch.full((len(node),), self.landmarks.dim, device=device)
+        first.scatter_reduce_(0, block, self.landmarks.column[landmark], "amin")
+        table, group = self._groups(node, first, width)
+        group_count, size = table.shape
         window = torch.unique(group[block] * count + self.landmarks.position[landmark])
         window = _joined(window, count)
         of, landmark = window // count, self.landmarks.ordered[window % count]
@@ -189,7 +183,6 @@ class WindowBuilder:
         breaks[1:] |= of[1:] != of[:-1]
         runs = torch.zeros_like(total).index_add_(0, of, breaks.long())
         in_runs = (total >= _WORTH_RUNS) & (total >= _RUN * runs) & self.in_place
-        table = table.view(group_count, size)
         batches = []
         for kind in torch.unique(2 * padded + in_runs).tolist():
             w, by_run = kind // 2, bool(kind % 2)
@@ -209,12 +202,35 @@ class WindowBuilder:
         self.groups += group_count
         return node, neighbour, batches
 
+    def _groups(
+        self, node: Int[Tensor, " g"], first: Int[Tensor, " g"], width: Float[Tensor, " g"]
+    ) -> tuple[Int[Tensor, "b s"], Int[Tensor, " g"]]:
+        """Groups of blocks that begin near each other in the reduced system, and each block's; `n` where there are fewer."""
+        # Blocks that see lanes have windows several times as wide as those that see signs alone: keep them apart.
+        wide = width > width.mean()
+        order = torch.argsort(first + wide * (self.landmarks.dim + 1), stable=True)
+        first, width = first[order], width[order]
+        begins = torch.ones_like(first, dtype=torch.bool)
+        begins[1:] = (first[1:] - first[:-1]).abs() > _APART * torch.maximum(width[1:], width[:-1])
+        run = begins.cumsum(0) - 1
+        count = torch.bincount(run)
+        place = torch.arange(len(node), device=node.device) - (count.cumsum(0) - count)[run]
+        groups = -(-count // self.group_size)
+        each = -(-count // groups)
+        group = (groups.cumsum(0) - groups)[run] + place // each[run]
+        table = torch.full((int(groups.sum()), int(each.max())), self.n, device=node.device)
+        table[group, place % each[run]] = node[order]
+        of_node = torch.empty_like(group)
+        of_node[order] = group
+        return table, of_node
+
     def round(
         self,
         node: Tensor,
         neighbour: Tensor,
         batches: list[tuple[Tensor, Tensor, bool]],
         place: Tensor,
+        pattern: TilePattern,
     ) -> Round:
         """The round with the rows that every fill-in goes to; once all rounds have their windows."""
         towards = torch.full(
@@ -228,15 +244,20 @@ class WindowBuilder:
             here = slice(self.places, self.places + nodes.numel())
             self.places = here.stop
             beside.append(place[receiver].flatten(0, 1))
-            products = self._products(columns) if by_run else None
+            products = self._products(columns, pattern) if by_run else None
             built.append(Batch(here, columns, fill, self.batch_rows.pop(0), products))
         return Round(slice(first, self.places), torch.cat(beside), tuple(built))
 
-    def _products(self, columns: Tensor) -> tuple[tuple[int, Product], ...]:
-        """The pairs of runs of windows, and the stripe of the reduced system that each pair is in."""
-        dim, products = self.landmarks.dim, []
+    def bound(self) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+        """The groups so far, and the places of the landmarks in their windows, in the order of columns."""
+        keys = self._sorted()
+        return keys // self.landmarks.count, keys % self.landmarks.count
+
+    def _products(self, columns: Tensor, pattern: TilePattern) -> tuple[tuple[int, Product], ...]:
+        """The pairs of runs of windows within a tile, and the row of tiles that each pair is in."""
+        dim, width, products = pattern.dim, pattern.width, []
         before = torch.nn.functional.pad(columns, (1, 0), value=-1)[:, :-1]
-        begins = (columns < dim) & ((columns != before + 1) | (columns % self.stripe == 0))
+        begins = (columns < dim) & ((columns != before + 1) | (columns % width == 0))
         group, first = torch.nonzero(begins, as_tuple=True)
         column = columns[group, first]
         total = (columns < dim).sum(1) + 1
@@ -244,11 +265,16 @@ class WindowBuilder:
         last = torch.where(last > first, last, total[group])
         runs = torch.stack((group, first, last, column), dim=1).tolist()
         ends = torch.searchsorted(group, group, right=True).tolist()
+        number = pattern.number
         for i, (b, start, stop, at) in enumerate(runs):
-            rows, here = slice(start, stop), slice(at, at + stop - start)
-            products.append((-1, Product(b, slice(0, 1), rows, (slice(dim, dim + 1), here))))
-            for beside, there in _in_one(runs[i : ends[i]]):
-                products.append((at // self.stripe, Product(b, rows, beside, (here, there))))
+            rows, tile = slice(start, stop), at // width
+            right = slice(at, at + stop - start)
+            products.append((-1, Product(b, slice(0, 1), rows, -1, (slice(0, 1), right))))
+            here = slice(at % width, at % width + stop - start)
+            for _, begin, end, column_of in runs[i : ends[i]]:
+                there = slice(column_of % width, column_of % width + end - begin)
+                into = number[tile][column_of // width]
+                products.append((tile, Product(b, rows, slice(begin, end), into, (here, there))))
         return tuple(products)
 
     def _fill_rows(self, columns: Tensor, receiver: Tensor) -> Tensor:
@@ -276,11 +302,17 @@ class WindowBuilder:
             parts.append(start[:, None] + torch.arange(width, device=block.device))
         return torch.cat(parts, dim=-1).flatten()
 
+    def _sorted(self) -> Int[Tensor, " n"]:
+        """Keys `group * count + place` of all windows."""
+        if self.window_keys:
+            self._keys = torch.cat([self._keys, *self.window_keys])
+            self._places = torch.cat([self._places, *self.window_places])
+            self.window_keys, self.window_places = [], []
+        return self._keys
+
     def _place(self, group: Tensor, landmark: Tensor) -> tuple[Tensor, Tensor]:
         """Where a landmark stands in a group's window, and whether it does."""
-        if self.window_keys:
-            self._keys, self._places = torch.cat(self.window_keys), torch.cat(self.window_places)
-            self.window_keys, self.window_places = [], []
+        self._sorted()
         group, landmark = torch.broadcast_tensors(group, landmark)
         if not len(self._keys):
             return torch.zeros_like(landmark), torch.zeros_like(landmark, dtype=torch.bool)
@@ -316,17 +348,6 @@ def _expand(
 def _in_place(device: torch.device) -> bool:
     """Whether products may be subtracted in place, run by run: where a call costs little."""
     return device.type == "cpu"
-
-
-def _in_one(runs: Iterable[Sequence[int]]) -> list[tuple[slice, slice]]:
-    """Runs (group, first row of its window, behind its last, first column), in one where they follow each other."""
-    joined: list[list[int]] = []
-    for _, start, stop, column in runs:
-        if joined and joined[-1][1] == start and joined[-1][2] + start - joined[-1][0] == column:
-            joined[-1][1] = stop
-        else:
-            joined.append([start, stop, column])
-    return [(slice(a, b), slice(at, at + b - a)) for a, b, at in joined]
 
 
 def _joined(window: Int[Tensor, " n"], count: int) -> Int[Tensor, " m"]:

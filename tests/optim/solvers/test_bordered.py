@@ -41,7 +41,7 @@ def test_covariances_are_blocks_of_the_dense_inverse(world):
     found = BorderedBackend(plan).assemble(problem, values).covariance(floor=0.0)
     mark, drift = rows_of(dense, "mark"), rows_of(dense, "drift")
     at = found.where.entries("mark", slice(None)).flatten()
-    of_marks = found.matrix[at][:, at]
+    of_marks = found.solve(torch.eye(found.where.dim).double())[at][:, at]
     torch.testing.assert_close(of_marks, inverse[mark][:, mark], rtol=1e-8, atol=1e-12)
     per_chain = torch.zeros(len(drift), 4, 2, dtype=torch.float64)
     rows = torch.arange(len(drift))
@@ -50,8 +50,16 @@ def test_covariances_are_blocks_of_the_dense_inverse(world):
     joint = (sums.mT @ inverse[drift][:, drift] @ sums).view(4, 2, 4, 2)
     every = torch.arange(4)
     expected = joint[every, :, every]
-    torch.testing.assert_close(found.of_chain_sums(weight), expected, rtol=1e-8, atol=1e-12)
-    for name in plan.border_names:
+    torch.testing.assert_close(
+        found.of_sums(weight, torch.arange(3), 4), expected, rtol=1e-8, atol=1e-12
+    )
+    # Two chains of one sum.
+    of = torch.tensor([0, 1, 0])
+    both = joint.view(4, 2, 4, 2)
+    expected[0] += expected[2] + both[0, :, 2] + both[2, :, 0]
+    expected = expected[:2]
+    torch.testing.assert_close(found.of_sums(weight, of, 2), expected, rtol=1e-8, atol=1e-12)
+    for name in plan.border:
         at = rows_of(dense, name).view(len(values[name]), -1)
         expected = inverse[at[:, :, None], at[:, None]]
         torch.testing.assert_close(found.of_border(name), expected, rtol=1e-8, atol=1e-12)
@@ -63,7 +71,7 @@ def test_a_covariance_whose_factors_are_gone_is_refused():
     covariance = normal.covariance()
     normal.solve(torch.tensor([1e-3], dtype=torch.float64))
     with pytest.raises(ValueError, match="solved since"):
-        covariance.of_chain_sums(torch.zeros(len(plan.chain), 2, 1, dtype=torch.float64))
+        covariance.of_sums(torch.zeros(len(plan.chain), 2, 1).double(), torch.arange(3), 3)
 
 
 @pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])

@@ -11,7 +11,6 @@ from worlds.bordered_chains import drives, rows_of, shared_drives
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values
 from crowdmap_torch.optim.solvers.bordered import BorderedBackend
-from crowdmap_torch.optim.solvers.conjugate_gradient import ConjugateGradientBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import (
     Backend,
@@ -21,11 +20,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 )
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 
-BACKENDS = {
-    "dense": lambda plan: DenseBackend(),
-    "bordered": BorderedBackend,
-    "conjugate gradients": lambda plan: ConjugateGradientBackend(plan, tolerance=1e-12),
-}
+BACKENDS = {"dense": lambda plan: DenseBackend(), "bordered": BorderedBackend}
 DAMPING = torch.tensor([1e-2], dtype=torch.float64)
 
 
@@ -73,17 +68,6 @@ def test_what_another_chain_shares_is_refused():
     terms = {**problem.terms, "bound": wrong}
     with pytest.raises(ValueError, match="'car' of another chain"):
         BorderedBackend(plan).assemble(replace(problem, terms=terms), values)
-
-
-def test_a_border_beside_landmarks_is_refused():
-    problem, values, plan = drives()
-    beside = CostTerm(
-        lambda b, m: b - m, (("bias", torch.tensor([0])), ("mark", torch.tensor([0])))
-    )
-    with pytest.raises(ValueError, match="with landmarks"):
-        BorderedBackend(plan).assemble(
-            replace(problem, terms={**problem.terms, "beside": beside}), values
-        )
 
 
 def functions_of_marks(generator: torch.Generator) -> LinearFunctions:
@@ -135,19 +119,3 @@ def test_what_functions_have_in_common_is_all_that_can_be_taken_off_them(generat
     left = torch.linalg.eigvalsh(joint - alike @ common @ alike.mT)
     # The floor of covariances is 1e-9 of information, of variances of a tenth.
     assert (left[:2].abs() < 1e-6 * left[-1]).all() and (left[2:] > 0).all()
-
-
-def test_samples_answer_the_same_questions(generator):
-    problem, values, plan = drives(lengths=(5, 1, 4))
-    functions = functions_of_marks(generator)
-    weight = torch.randn(len(plan.chain), 2, 1, dtype=torch.float64, generator=generator)
-    exact = BorderedBackend(plan).assemble(problem, values).covariance()
-    backend = ConjugateGradientBackend(plan, samples=4000, sample_tolerance=1e-6)
-    sampled = backend.assemble(problem, values).covariance()
-    for one, other in (
-        (exact.of(functions), sampled.of(functions)),
-        (exact.of_chain_sums(weight), sampled.of_chain_sums(weight)),
-    ):
-        # An entry's standard deviation is at most sqrt(2 / count) of the variances' product.
-        largest = one.diagonal(dim1=1, dim2=2).amax(-1)[:, None, None]
-        assert ((one - other).abs() <= 6 * (2 / 4000) ** 0.5 * largest + 1e-12).all()

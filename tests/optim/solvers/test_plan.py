@@ -10,7 +10,7 @@ from crowdmap_torch.optim.solvers.plan import EliminationPlan
 
 def test_blocks_are_counted_over_leaves_and_chains():
     chain, carrier = torch.tensor([4, 4, 2]), torch.tensor([2, 0, 1, 2])
-    plan = EliminationPlan("drift", chain, "pose", carrier, "bias")
+    plan = EliminationPlan("drift", chain, "pose", carrier)
     assert plan.first_block == {"pose": 0, "drift": 4}
     assert plan.owner.tolist() == [2, 4, 4, 2, 4, 4, 2]
     assert (plan.chain_count, plan.leaf_count) == (2, 4)

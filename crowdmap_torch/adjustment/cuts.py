@@ -1,0 +1,50 @@
+"""Where long drives are cut: all of them at the same places, so that what lies within a square is bound to little else."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+_OVER = 0.1
+"""Share of a square's width that a drive goes beyond it before it has left: along a border it is not cut to pieces."""
+_ROAD_M = 50.0
+"""Width of the squares by which the length of the roads driven is told."""
+_WHOLE = 2.0
+"""Maps of at most so many times the unknowns of a square are not cut."""
+
+
+def cut_drives(
+    position: Float[Tensor, "n 2"], journey: Int[Tensor, " n"], unknowns: int, in_square: int
+) -> Int[Tensor, " s"]:
+    """The nodes that drives are cut before, where the landmarks of a square have about `in_square` unknowns.
+
+    `unknowns` are those of all landmarks along the roads that the nodes are on.
+    """
+    if not in_square or unknowns <= _WHOLE * in_square or not len(position):
+        return journey[:0]
+    squares = torch.unique((position / _ROAD_M).floor(), dim=0)
+    return cut_at_squares(position, journey, in_square / unknowns * len(squares) * _ROAD_M)
+
+
+def cut_at_squares(
+    position: Float[Tensor, "n 2"], journey: Int[Tensor, " n"], width_m: float
+) -> Int[Tensor, " s"]:
+    """The nodes at which drives leave one of the squares of this width; journeys one by one, in order."""
+    square = (position / width_m).floor()
+    ends = torch.nonzero(journey[1:] != journey[:-1])[:, 0] + 1
+    found, start = [], 0
+    for stop in [*ends.tolist(), len(journey)]:
+        at = start
+        while at < stop:
+            beyond = position[at:stop] / width_m - square[at]
+            outside = ((beyond < -_OVER) | (beyond > 1 + _OVER)).any(1)
+            if not bool(outside.any()):
+                break
+            gone = int(outside.long().argmax())
+            # Where it crossed the border for good: those who come the other way are cut there as well.
+            within = ((beyond[:gone] >= 0) & (beyond[:gone] < 1)).all(1)
+            found.append(at + int(torch.nonzero(within)[-1]) + 1)
+            at += gone
+        start = stop
+    return torch.tensor(found, dtype=torch.long, device=position.device)

@@ -1,0 +1,201 @@
+"""Large symmetric matrices of which most is zero: square tiles on and above the diagonal, those alone that hold anything.
+
+Landmarks along roads are bound to those near them, so of the tiles in a row there are a few, however long the road: memory
+grows with the tiles, not with the square of the unknowns. Where everything is bound to everything all tiles are there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+_ONE_TILE = 768
+"""Unknowns up to which one tile holds everything."""
+_WIDTH = 160
+"""Of tiles on a processor: what fits its cache, and no more zeros than need be."""
+_WIDTH_CUDA = 1024
+"""Of tiles on a GPU, where a call costs as much as the arithmetic of a small one."""
+_ABSENT = -(1 << 60)
+"""Where no tile is: no place in any memory."""
+
+
+def tile_width(dim: int, device: torch.device) -> int:
+    """Width of the tiles of a matrix of so many unknowns."""
+    if dim <= _ONE_TILE:
+        return max(dim, 1)
+    return _WIDTH if device.type == "cpu" else min(_WIDTH_CUDA, dim)
+
+
+@dataclass(frozen=True)
+class TilePattern:
+    """Which tiles there are, row by row, and where each is kept.
+
+    Behind the tiles there is room for a right-hand side, whose row is called `dim`, and for what is to be forgotten: what
+    would stand below the diagonal's tiles, and all of row or column `dim + 1`.
+    """
+
+    dim: int
+    width: int
+    present: Bool[Tensor, "t t"]
+    """Above the diagonal, and on it; the diagonal's are all there."""
+    number: tuple[tuple[int, ...], ...]
+    """Of each that is there; -1 else."""
+    columns: tuple[tuple[int, ...], ...]
+    """By row, the columns of the tiles right of the diagonal."""
+    own: Int[Tensor, " t"]
+    """Numbers of the diagonal's."""
+    base: Int[Tensor, "u u"]
+    """Where in memory each tile begins, those of the right-hand side and of what is forgotten included."""
+
+    @classmethod
+    def of(
+        cls, dim: int, width: int, present: NDArray[np.bool_], device: torch.device
+    ) -> TilePattern:
+        """That of tiles of which those above the diagonal count."""
+        upper = np.triu(present)
+        np.fill_diagonal(upper, val=True)
+        number = np.where(upper, np.cumsum(upper).reshape(upper.shape) - 1, -1)
+        tiles, area, count = len(upper), width * width, int(upper.sum())
+        behind = count * area
+        forgotten = behind + tiles * width
+        base = np.full((tiles + 2, tiles + 2), forgotten, dtype=np.int64)
+        inner = np.where(upper, number * area, _ABSENT)
+        base[:tiles, :tiles] = np.where(np.tri(tiles, k=-1, dtype=bool), forgotten, inner)
+        base[tiles, :tiles] = behind + width * np.arange(tiles)
+        return cls(
+            dim=dim,
+            width=width,
+            present=torch.from_numpy(upper).to(device),
+            number=tuple(map(tuple, number.tolist())),
+            columns=tuple(
+                tuple((np.nonzero(row[i + 1 :])[0] + i + 1).tolist()) for i, row in enumerate(upper)
+            ),
+            own=torch.from_numpy(number.diagonal().copy()).to(device),
+            base=torch.from_numpy(base).to(device),
+        )
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of the diagonal."""
+        return len(self.columns)
+
+    @property
+    def count(self) -> int:
+        """All tiles."""
+        return self.tiles + sum(len(row) for row in self.columns)
+
+    @property
+    def size(self) -> int:
+        """Numbers to be kept."""
+        return (self.count + 1) * self.width**2 + self.tiles * self.width
+
+    def filled(self) -> TilePattern:
+        """That of the Cholesky factor: a row leaves its tiles behind in the row of the first of them."""
+        upper = self.present.cpu().numpy().copy()
+        for row in range(len(upper)):
+            right = np.nonzero(upper[row, row + 1 :])[0]
+            if len(right):
+                first = row + 1 + right[0]
+                upper[first] |= upper[row]
+                upper[first, :first] = False
+        return TilePattern.of(self.dim, self.width, upper, self.own.device)
+
+    def numbers_of(self, other: TilePattern) -> Int[Tensor, " count"]:
+        """The numbers here of another pattern's tiles, which are among these."""
+        row, column = torch.nonzero(other.present, as_tuple=True)
+        table = torch.tensor(self.number, dtype=torch.long, device=row.device).view(
+            self.tiles, self.tiles
+        )
+        return table[row, column]
+
+    def place(self, entry: Int[Tensor, ...]) -> tuple[Int[Tensor, ...], Int[Tensor, ...]]:
+        """The tile of an entry, and where in it that is; `dim` is the right-hand side, `dim + 1` forgotten."""
+        tile = torch.div(entry, self.width, rounding_mode="floor")
+        within = entry - tile * self.width
+        beyond = entry - self.dim
+        tile = torch.where(beyond >= 0, self.tiles + beyond, tile)
+        return tile, torch.where(beyond >= 0, 0, within)
+
+    def at(self, row: Int[Tensor, ...], column: Int[Tensor, ...]) -> Int[Tensor, ...]:
+        """Where in memory entries are, rows and columns broadcast; no place at all where there is no tile."""
+        (down, r), (right, c) = self.place(row), self.place(column)
+        return self.base[down, right] + (r * self.width + c)
+
+
+@dataclass(frozen=True)
+class TileMatrix:
+    """A symmetric matrix, and a right-hand side beside it."""
+
+    pattern: TilePattern
+    flat: Float[Tensor, " size"]
+
+    @classmethod
+    def zeros(cls, pattern: TilePattern, like: Tensor) -> TileMatrix:
+        """Of the type and the device of `like`."""
+        return cls(pattern, like.new_zeros(pattern.size))
+
+    @property
+    def tiles(self) -> Float[Tensor, "count w w"]:
+        """The tiles, by number."""
+        w = self.pattern.width
+        return self.flat[: self.pattern.count * w * w].view(-1, w, w)
+
+    @property
+    def right_side(self) -> Float[Tensor, " r"]:
+        """The right-hand side."""
+        start = self.pattern.count * self.pattern.width**2
+        return self.flat[start : start + self.pattern.dim]
+
+    def diagonal(self) -> Float[Tensor, " r"]:
+        """Its diagonal."""
+        of_tiles = self.tiles[self.pattern.own].diagonal(dim1=-2, dim2=-1)
+        return of_tiles.flatten()[: self.pattern.dim]
+
+    def add_diagonal(self, added: Float[Tensor, " r"]) -> None:
+        """Adds to its diagonal, in place; behind its end stands a one."""
+        number, w = self.pattern.own, self.pattern.width
+        padded = added.new_ones(self.pattern.tiles * w)
+        padded[: self.pattern.dim] = added
+        entry = torch.arange(w, device=added.device) * (w + 1)
+        self.flat.index_add_(0, (number[:, None] * w * w + entry).flatten(), padded)
+
+    def add(
+        self, row: Int[Tensor, " m"], column: Int[Tensor, " m"], block: Float[Tensor, "k l m"]
+    ) -> None:
+        """Adds blocks, each from its row and column on, in place; what is below the diagonal's tiles is left out."""
+        height, width, _ = block.shape
+        down = torch.arange(height, device=row.device)[:, None, None]
+        right = torch.arange(width, device=row.device)[:, None]
+        self.flat.index_add_(
+            0, self.pattern.at(row + down, column + right).flatten(), block.flatten()
+        )
+
+    def copy_from(self, other: TileMatrix, number: Int[Tensor, " count"]) -> None:
+        """Takes the tiles of another matrix, which have these numbers here, in place; the right-hand side stays."""
+        tiles = self.tiles
+        tiles.zero_()
+        tiles[number] = other.tiles
+
+    def read(self, row: Int[Tensor, ...], column: Int[Tensor, ...]) -> Float[Tensor, ...]:
+        """Entries, rows and columns broadcast; ValueError where there is no tile."""
+        row, column = torch.minimum(row, column), torch.maximum(row, column)
+        at = self.pattern.at(row, column)
+        if bool((at < 0).any()):
+            raise ValueError(
+                "entries between unknowns that nothing binds to each other are not kept"
+            )
+        return self.flat[at]
+
+    def dense(self) -> Float[Tensor, "r r"]:
+        """All entries, zeros included."""
+        w, tiles = self.pattern.width, self.pattern.tiles
+        whole = self.flat.new_zeros(tiles, w, tiles, w)
+        row, column = torch.nonzero(self.pattern.present, as_tuple=True)
+        whole[row, :, column] = self.tiles
+        matrix = whole.view(tiles * w, tiles * w)[: self.pattern.dim, : self.pattern.dim]
+        return matrix.triu() + matrix.triu(1).mT
