@@ -7,7 +7,7 @@ does it all; `commands/optimize.py` spells out the same calls with logging betwe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -32,14 +32,18 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
 from crowdmap_torch.crowd_signs.gather import gather_signs
 from crowdmap_torch.crowd_signs.outages import outside_outages
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
+from crowdmap_torch.fleet.choice import engine_of
+from crowdmap_torch.fleet.engine import Engine
+from crowdmap_torch.fleet.here import InProcess
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.maps import as_map
+from crowdmap_torch.io.stored_drives import StoredDrive
 from crowdmap_torch.lanes.reconstruct import LaneReport, reconstruct_lanes
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.processes.threads import one_core_each
-from crowdmap_torch.processes.workers import Workers
+from crowdmap_torch.processes.workers import Call
 from crowdmap_torch.road.estimate import estimate_road
 from crowdmap_torch.signs.triangulate import SignReport, triangulate_signs
 from crowdmap_torch.survey.control import find_control_signs
@@ -147,7 +151,8 @@ def build_map(
     Signs that are in `control` pin the map.
     """
     journeys = dataset.journeys
-    maps = map_journeys(journeys, config, workers=workers, progress=progress)
+    with engine_of(None, workers=workers) as engine:
+        maps = map_journeys(journeys, config, engine=engine, progress=progress)
     first = first_map(journeys, maps, config)
     bundle = build_bundle(journeys, maps, first, config, control=control)
     state = begun = adjust.start(bundle)
@@ -161,39 +166,42 @@ def map_journeys(
     journeys: Sequence[Journey],
     config: MapperConfig,
     *,
-    workers: int = 1,
+    engine: Engine | None = None,
+    stored: Sequence[StoredDrive] | None = None,
     progress: ProgressCall = silent,
     known: Mapping[int, JourneyMap] | None = None,
     keep: KeepCall = forget,
 ) -> tuple[JourneyMap, ...]:
-    """Section IV for every journey, `workers` at a time, each on one core; the result does not depend on how many.
+    """Section IV for every journey, by the workers of an engine (None: in this process), each on one core.
 
-    Those that are `known`, by number, are taken as they are; `keep` is handed the others with their numbers, as soon as
-    each is there. ChildProcessError, with the journey's name, if the process of a journey is killed.
+    The result depends neither on the engine nor on its workers. Those read the journeys themselves where these are `stored`,
+    else they are handed over; drives on a GPU stay in this process. Those that are `known`, by number, are taken as they
+    are; `keep` is handed the others with their numbers, as soon as each is there. ChildProcessError, with the journey's
+    name, if the worker of a journey is killed again and again.
     """
     stage, total = "single journeys", len(journeys)
     maps = dict(known or {})
     progress(stage, len(maps), total)
-    for number, made in _mapped(journeys, config, workers, maps.keys()):
+    left = [number for number in range(total) if number not in maps]
+    if engine is None or any(journeys[number].t_ns.is_cuda for number in left[:1]):
+        engine = InProcess()
+    calls: list[Call] = [
+        (journeys[n].journey_id, map_journey, (journeys[n], n, config))
+        if stored is None or engine.shares_memory
+        else (journeys[n].journey_id, map_stored, (stored[n], n, config))
+        for n in left
+    ]
+    for place, made in engine.each(calls):
+        number = left[place]
         maps[number] = made
         keep(number, made)
         progress(stage, len(maps), total)
     return tuple(maps[number] for number in range(total))
 
 
-def _mapped(
-    journeys: Sequence[Journey], config: MapperConfig, workers: int, known: Collection[int]
-) -> Iterator[tuple[int, JourneyMap]]:
-    """The maps of the journeys that are not `known`, in whatever order they are there."""
-    left = [number for number in range(len(journeys)) if number not in known]
-    if workers <= 1 or len(left) <= 1 or journeys[0].t_ns.is_cuda:
-        for number in left:
-            yield number, map_journey(journeys[number], number, config)
-        return
-    calls = ((journeys[n].journey_id, map_journey, (journeys[n], n, config)) for n in left)
-    with Workers(min(workers, len(left)), torch.set_num_threads, 1) as pool:
-        for place, made in pool.each(calls):
-            yield left[place], made
+def map_stored(drive: StoredDrive, number: int, config: MapperConfig) -> JourneyMap:
+    """Section IV of a journey that is read where the work is done."""
+    return map_journey(drive.read(), number, config)
 
 
 @one_core_each()

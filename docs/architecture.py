@@ -19,7 +19,7 @@ PAGE = ROOT / "docs" / "ARCHITECTURE.md"
 PACKAGE = "crowdmap_torch"
 FLOORS = (
     ("ranges", "processes", "notebook"),
-    ("geometry", "optim", "clustering"),
+    ("fleet", "geometry", "optim", "clustering"),
     ("tables",),
     ("residuals",),
     ("noise",),

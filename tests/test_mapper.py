@@ -15,6 +15,7 @@ from worlds.drives import turn_about_up, with_frames, with_shuffled_rows
 
 from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.fleet.beside import Processes
 from crowdmap_torch.geometry import se3, spline_length
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import certain_part
@@ -148,8 +149,9 @@ def test_workers_give_what_one_process_gives(tiny: Dataset):
     journeys: Sequence[Journey] = [
         with_frames(j, torch.arange(0, 40, 2)) for j in tiny.journeys[:2]
     ]
-    alone = map_journeys(journeys, CONFIG, workers=1)
-    together = map_journeys(journeys, CONFIG, workers=2)
+    alone = map_journeys(journeys, CONFIG)
+    with Processes(2) as engine:
+        together = map_journeys(journeys, CONFIG, engine=engine)
     assert any(len(m.signs) for m in alone) and any(len(m.lanes) for m in alone)
     assert [m.signs.journey.unique().tolist() for m in together if len(m.signs)] == [
         m.signs.journey.unique().tolist() for m in alone if len(m.signs)

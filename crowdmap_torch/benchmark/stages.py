@@ -37,6 +37,8 @@ class Measured:
     processor_s: float
     peak_gb: float
     """Most memory of all processes together at one time; what several share counts once."""
+    main_gb: dict[str, float]
+    """The most that the main process held, by stage; states before that was told have none."""
     relative_m: float | None
     """The map's relative error against its survey, where there is one."""
 
@@ -88,6 +90,9 @@ def table(names: Sequence[str], runs: Sequence[Sequence[Measured]]) -> list[str]
     rows.append(
         ("memory of all processes [GB]", [median(one.peak_gb for one in of) for of in runs], 2)
     )
+    for stage in dict.fromkeys(stage for of in runs for one in of for stage in one.main_gb):
+        held = [median(one.main_gb.get(stage, 0.0) for one in of) for of in runs]
+        rows.append((f"of the main one, {stage} [GB]", held, 2))
     errors = [[one.relative_m for one in of if one.relative_m is not None] for of in runs]
     if all(errors):
         rows.append(("relative error [m]", [median(of) for of in errors], 4))
@@ -133,7 +138,8 @@ def measured(checkout: Path, dataset: Path, workers: int) -> Measured:
         stages[_BESIDE] = wall - sum(stages.values())
         survey = metrics.get("survey") or {}
         relative = survey.get("signs", {}).get("relative", {}).get("total", {}).get("mean")
-        return Measured(stages, wall, used.ru_utime + used.ru_stime, peak / 1e9, relative)
+        held = metrics.get("memory_gb", {})
+        return Measured(stages, wall, used.ru_utime + used.ru_stime, peak / 1e9, held, relative)
 
 
 def _memory(pid: int) -> int:

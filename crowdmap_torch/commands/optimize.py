@@ -14,7 +14,7 @@ import io
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,12 +32,15 @@ from crowdmap_torch.config import MapperConfig, dump, load_config
 from crowdmap_torch.evaluation.evaluate import against, control_ids_of
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
+from crowdmap_torch.fleet.choice import ENGINES, engine_of
+from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.io.area import Area, Cut, cut_dataset, cut_truth, read_area
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
 from crowdmap_torch.io.documents import plain
-from crowdmap_torch.io.errors import InputError, input_read, one_line
+from crowdmap_torch.io.errors import InputError, input_read, needing, one_line
 from crowdmap_torch.io.maps import certain_part
+from crowdmap_torch.io.stored_drives import stored_drives
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.plausibility.dataset import look_over
@@ -104,9 +107,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers",
         type=argument(Workers),
-        default=os.cpu_count() or 1,
         metavar="N",
         help="journeys mapped at a time (default: one for each core)",
+    )
+    parser.add_argument(
+        "--engine",
+        choices=ENGINES,
+        help="where journeys are mapped: in this process, in processes beside it (default), on Ray",
+    )
+    parser.add_argument(
+        "--address",
+        metavar="HOST:PORT",
+        help="of a Ray cluster (default: one of this machine, which ends with the run)",
     )
     parser.add_argument(
         "--strict", action="store_true", help="a bad journey or an empty map is an error"
@@ -143,15 +155,16 @@ def run(options: argparse.Namespace) -> int:
     with input_read():
         refuse_overlap(options.out, options.dataset)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
-        device = _device(options.device)
+        engine = _engine(options, _device(options.device))
     # The folder first: whether it can be written, and by nobody else, is known before anything is read at length.
     with keeping(folder.kept), folder.claimed(), one_core_each():
-        return _map(options, folder, config, device)
+        return _map(options, folder, config, engine)
 
 
 def _map(
-    options: argparse.Namespace, folder: RunFolder, config: MapperConfig, device: torch.device
+    options: argparse.Namespace, folder: RunFolder, config: MapperConfig, engine: Engine
 ) -> int:
+    device = torch.device(options.device)
     with input_read():
         given = _read(options, config, device)
         dataset, survey, truth = given.dataset, given.survey, given.truth
@@ -170,14 +183,11 @@ def _map(
 
         # ---- one journey at a time (section IV) ----
         journeys = dataset.journeys
-        maps = mapper.map_journeys(
-            journeys,
-            config,
-            workers=options.workers,
-            progress=progress,
-            known=found.journeys,
-            keep=keep_and_log(kept.keep_journey, log, journeys),
-        )
+        stored = stored_drives(options.dataset, dataset, inputs["journey"], config.reading)
+        keep = keep_and_log(kept.keep_journey, log, journeys)
+        with _begun(engine, is_needed=len(found.journeys) < len(journeys)) as where:
+            how = {"engine": where, "stored": stored, "progress": progress, "keep": keep}
+            maps = mapper.map_journeys(journeys, config, known=found.journeys, **how)
 
         # ---- landmarks of all journeys told apart, biases found (section V-A) ----
         progress("clusters and biases")
@@ -218,11 +228,12 @@ def _map(
         progress.finish()
         missing = _told(missing_findings(dataset, result, config), dataset)
         warnings = (*findings, *_told(unsettled_findings(first), dataset), *missing)
-        metrics = metrics_of(dataset, result, config, watch.iterations, progress.seconds, *compared)
+        spent = progress, engine.spent_on()
+        metrics = metrics_of(dataset, result, config, watch.iterations, *spent, *compared)
         folder.write_metrics({**metrics, "area": plain(given.cut), "warnings": plain(warnings)})
         with _spared("report"):
             outcomes = folder.keep_outcomes(sign_outcomes(dataset, result, bundle, config))
-            known = (progress.seconds, survey, truth, *compared, warnings, outcomes)
+            known = (progress, survey, truth, *compared, warnings, outcomes)
             record = record_of(dataset, result, config, watch, *known, _facts(options, given.cut))
             write_report(folder.unfinished / folder.report.name, record)
     kept.finish()
@@ -377,6 +388,29 @@ def _area(text: str) -> Area:
         return read_area(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _engine(options: argparse.Namespace, device: torch.device) -> Engine:
+    """Where journeys are mapped, not begun yet."""
+    name = options.engine
+    if device.type == "cuda":
+        if name not in (None, "local"):
+            raise ValueError(
+                f"--engine {name}: what runs on a GPU stays in this process; leave it out"
+            )
+        name = "local"
+    with needing(f"--engine {name}", "'crowdmap_torch[ray]'"):
+        return engine_of(name, workers=options.workers, address=options.address)
+
+
+@contextmanager
+def _begun(engine: Engine, *, is_needed: bool) -> Iterator[Engine | None]:
+    """The engine at work, and no engine where there is none for it."""
+    with ExitStack() as stack:
+        if is_needed:
+            with input_read():
+                stack.enter_context(engine)
+        yield engine if is_needed else None
 
 
 def _device(name: str) -> torch.device:

@@ -91,11 +91,9 @@ def _load_dataset(folder: Path, strict: bool, wanted: Sequence[str] | None) -> D
     once = [k for k, journey in enumerate(journeys) if journey.journey_id not in doubles]
     journeys, names = [journeys[k] for k in once], [names[k] for k in once]
     all_names = tuple(sorted(set().union(*names)))
-    recoded = (
-        _recode(journey, own, all_names) for journey, own in zip(journeys, names, strict=True)
-    )
+    alike = (recoded(journey, own, all_names) for journey, own in zip(journeys, names, strict=True))
     return Dataset(
-        origin=origin, journeys=tuple(recoded), rejected=tuple(rejected), type_names=all_names
+        origin=origin, journeys=tuple(alike), rejected=tuple(rejected), type_names=all_names
     )
 
 
@@ -258,11 +256,11 @@ def printable(name: str) -> str:
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
-def _recode(journey: Journey, own: tuple[str, ...], names: tuple[str, ...]) -> Journey:
-    """The journey with the signs' `type` counted in `names` instead of its own list."""
+def recoded(journey: Journey, own: Sequence[str], names: Sequence[str]) -> Journey:
+    """The journey with the signs' `type` counted in `names`, which has all of them, instead of in its `own` list."""
     place = {name: code for code, name in enumerate(names)}
-    # The last entry is for -1.
-    table = torch.tensor([*(place[name] for name in own), -1])
+    # The last entry is for -1; what is new in a file that has changed is none of them either.
+    table = torch.tensor([*(place.get(name, -1) for name in own), -1])
     signs = replace(journey.signs, type=table[journey.signs.type])
     return replace(journey, signs=signs)
 

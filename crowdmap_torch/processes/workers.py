@@ -18,6 +18,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
@@ -46,11 +47,20 @@ class _Worker:
     name: str = "the start of a process"
 
 
+class WorkerLost(ChildProcessError):
+    """A process that ended within a task; the text names the task and says how."""
+
+    def __init__(self, key: Any, text: str) -> None:
+        super().__init__(text)
+        self.key = key
+        """Of the task, which can be started again."""
+
+
 class Workers:
     """At most `count` processes, a context manager that ends them all.
 
     Functions, arguments and results are pickled. An exception of a task is raised here by `wait`; a process that was
-    killed is a ChildProcessError that names its task.
+    killed is a `WorkerLost` that names its task, and another one takes its place.
     """
 
     def __init__(self, count: int, begin: Callable[..., object], *arguments: object) -> None:
@@ -77,7 +87,10 @@ class Workers:
         self._send(worker, pickle.dumps((function, arguments)))
 
     def wait(self) -> list[tuple[Any, Any]]:
-        """Keys and results of what has been finished, at least one; one must have been started."""
+        """Keys and results of what has been finished, at least one; one must have been started.
+
+        WorkerLost if a process has ended within its task; the others go on.
+        """
         finished = []
         for connection in wait(list(self._busy)):
             assert isinstance(connection, Connection)
@@ -85,10 +98,13 @@ class Workers:
             try:
                 reply = connection.recv_bytes()
             except (EOFError, OSError):
+                if finished:
+                    # The next call tells of it.
+                    continue
+                del self._busy[connection]
+                connection.close()
                 raise self._died(worker) from None
-            is_well, made = pickle.loads(reply)
-            if not is_well:
-                raise made
+            made = taken(reply)
             self._idle.append(self._busy.pop(connection))
             finished.append((worker.key, made))
         return finished
@@ -139,12 +155,11 @@ class Workers:
         return worker
 
     def _send(self, worker: _Worker, message: bytes) -> None:
-        try:
+        # Where it has ended already, `wait` tells.
+        with suppress(OSError):
             worker.connection.send_bytes(message)
-        except OSError:
-            raise self._died(worker) from None
 
-    def _died(self, worker: _Worker) -> ChildProcessError:
+    def _died(self, worker: _Worker) -> WorkerLost:
         code = worker.process.wait()
         if code >= 0:
             how = f"its process ended with exit code {code}"
@@ -152,7 +167,15 @@ class Workers:
             how = "its process was killed (SIGKILL: by hand, or out of memory: fewer at a time need less)"
         else:
             how = f"its process was killed by {signal.Signals(-code).name}"
-        return ChildProcessError(f"{worker.name}: {how}")
+        return WorkerLost(worker.key, f"{worker.name}: {how}")
+
+
+def taken(reply: bytes) -> Any:
+    """The result that an `answer` holds; an exception of the task is raised."""
+    is_well, made = pickle.loads(reply)
+    if not is_well:
+        raise made
+    return made
 
 
 # ---- in the worker ----
@@ -171,14 +194,20 @@ def serve(number: int, parent: int) -> None:
     begin, arguments = pickle.loads(messages.get())
     begin(*arguments)
     while True:
-        outcome = _Outcome()
-        with outcome:
-            function, arguments = pickle.loads(messages.get())
-            outcome.reply = pickle.dumps((True, function(*arguments)))
+        reply = answer(messages.get())
         try:
-            connection.send_bytes(outcome.reply)
+            connection.send_bytes(reply)
         except OSError:
             os._exit(1)
+
+
+def answer(message: bytes) -> bytes:
+    """Calls the function that a message holds with its arguments; the result, or the exception it ended with, pickled."""
+    outcome = _Outcome()
+    with outcome:
+        function, arguments = pickle.loads(message)
+        outcome.reply = pickle.dumps((True, function(*arguments)))
+    return outcome.reply
 
 
 def _listen(connection: Connection, messages: queue.SimpleQueue[bytes]) -> None:

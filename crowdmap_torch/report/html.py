@@ -87,7 +87,7 @@ def _sections(record: RunRecord) -> Iterator[tuple[str, str, str]]:
     yield "adjustment", "Bundle adjustment", _adjustment(record)
     yield "signs", "Signs", sign_table(record)
     yield "pruned", "Left out", _pruned(record)
-    yield "timings", "Timings", timing_table(record.timings_s)
+    yield "timings", "Timings", timing_table(record.timings_s, record.memory_gb)
     yield "config", "Configuration", _config(record)
 
 

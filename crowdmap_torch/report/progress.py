@@ -1,4 +1,7 @@
-"""Progress on the terminal: one line that is rewritten where there is a terminal, plain lines where there is none."""
+"""Progress on the terminal: one line that is rewritten where there is a terminal, plain lines where there is none.
+
+What each stage took is kept: its time, and the most memory that this process held in it.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,19 @@ import sys
 import time
 from io import TextIOBase
 
+from crowdmap_torch.processes.memory import peak_bytes, restart_peak
+
 _PLAIN_EVERY_S = 10.0
 """Without a terminal a stage says no more often how far it is."""
 
 
 class Progress:
-    """Says which stage runs, how far it is, and when it will be done; keeps each stage's seconds."""
+    """Says which stage runs, how far it is, and when it will be done; keeps each stage's seconds and memory."""
 
     def __init__(self, stream: TextIOBase | None = None) -> None:
         self.seconds: dict[str, float] = {}
+        self.peak_gb: dict[str, float] = {}
+        """Of this process alone; empty where nobody tells."""
         self._stream = sys.stderr if stream is None else stream
         self._rewrites = self._stream.isatty()
         self._stage = ""
@@ -27,6 +34,7 @@ class Progress:
         if stage != self._stage:
             self.finish()
             self._stage, self._started = stage, now
+            restart_peak()
         elapsed = now - self._started
         self.seconds[stage] = elapsed
         text = stage if not total else f"{stage} {done}/{total}"
@@ -46,6 +54,8 @@ class Progress:
         if not self._stage:
             return
         self.seconds[self._stage] = time.monotonic() - self._started
+        if (peak := peak_bytes()) is not None:
+            self.peak_gb[self._stage] = max(self.peak_gb.get(self._stage, 0.0), peak / 1e9)
         if self._rewrites:
             self._stream.write(f"\r\x1b[K{self._stage}: {self.seconds[self._stage]:.1f} s\n")
             self._stream.flush()

@@ -20,6 +20,7 @@ from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.report.drives import CornerResiduals, Drift, corners_of, drifts_of
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.plots import Eigengap
+from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.stages import eigengaps_of
 from crowdmap_torch.report.summaries import (
     JourneySummary,
@@ -79,6 +80,8 @@ class RunRecord:
     """Why the bundle adjustment stopped."""
     timings_s: Mapping[str, float] = field(default_factory=dict)
     """By stage, in the order of the stages."""
+    memory_gb: Mapping[str, float] = field(default_factory=dict)
+    """The most that the main process held, by stage; empty where nobody tells."""
     config_yaml: str = ""
 
     @property
@@ -97,7 +100,7 @@ def record_of(
     result: MapResult,
     config: MapperConfig,
     watch: Watch,
-    seconds: Mapping[str, float],
+    progress: Progress,
     survey: Survey | None,
     truth: Truth | None,
     figures: MapFigures | None,
@@ -135,7 +138,8 @@ def record_of(
         drifts=drifts_of(dataset, result),
         iterations=tuple(watch.iterations),
         outcome=result.state.reasons[0],
-        timings_s=dict(seconds),
+        timings_s=dict(progress.seconds),
+        memory_gb=dict(progress.peak_gb),
         config_yaml=dump(config),
     )
 

@@ -221,13 +221,14 @@ def reasons_table(pruned: Sequence[Pruned]) -> str:
     )
 
 
-def timing_table(timings_s: Mapping[str, float]) -> str:
-    """Seconds of each stage, with a bar."""
+def timing_table(timings_s: Mapping[str, float], memory_gb: Mapping[str, float]) -> str:
+    """Seconds of each stage, with a bar, and what memory it took where that is known."""
     if not timings_s:
         return ""
     longest = max(max(timings_s.values()), 1e-9)
     rows = "".join(
         f"<tr><td>{escape(name)}</td><td>{seconds:.2f} s</td>"
+        f"<td>{f'{memory_gb[name]:.2f} GB' if name in memory_gb else ''}</td>"
         f'<td class="text" style="width:60%"><div class="bar" '
         f'style="width:{100 * seconds / longest:.1f}%"></div></td></tr>'
         for name, seconds in timings_s.items()

@@ -14,6 +14,7 @@ from crowdmap_torch.io.documents import plain
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.noise.pooled_scales import LEAST_SCALE, MOST_SCALE
 from crowdmap_torch.report.iteration import Iteration
+from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.summaries import (
     counts_of,
     journey_summaries,
@@ -29,17 +30,20 @@ def metrics_of(
     result: MapResult,
     config: MapperConfig,
     iterations: Sequence[Iteration],
-    seconds: Mapping[str, float],
+    progress: Progress,
+    workers: Mapping[str, object],
     figures: MapFigures | None,
     figures_before: MapFigures | None,
 ) -> dict[str, object]:
-    """metrics.json (FORMAT.md)."""
+    """metrics.json (FORMAT.md); `workers` is what the engine tells."""
     drive = {j.journey_id: float(station(j.T_world_camera)[-1]) for j in dataset.journeys}
     summaries = journey_summaries(dataset, result)
     return {
         "counts": counts_of(dataset, result, config),
         "pruned": plain(pruned_of(dataset, result, config)),
-        "times_s": dict(seconds),
+        "times_s": dict(progress.seconds),
+        "memory_gb": dict(progress.peak_gb),
+        "workers": dict(workers),
         "costs": [
             {
                 **{"iteration": i.number, "accepted": i.accepted, "judged": i.judged},

@@ -54,11 +54,11 @@ _FOUND = re.compile(
     rf"resuming: (\d+) of {_JOURNEYS} journeys(, clusters and biases)?(?:, step (\d+))?$", re.M
 )
 _TIMES = {
-    "map.json": ("provenance", "created_at"),
-    "metrics.json": ("times_s",),
+    "map.json": ("provenance.created_at",),
+    "metrics.json": ("times_s", "memory_gb", "workers"),
     "run.json": ("dataset",),
 }
-"""What differs between two runs on the same input, by file: times, and the way from the run to its data set."""
+"""What differs between two runs on the same input, by file: times and memory, and the way from the run to its data set."""
 
 
 @dataclass(frozen=True)
@@ -350,9 +350,12 @@ def _contents(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def _without(content: dict[str, Any], *keys: str) -> bytes:
-    inside = content
-    for key in keys[:-1]:
-        inside = inside[key]
-    del inside[keys[-1]]
+def _without(content: dict[str, Any], *places: str) -> bytes:
+    for place in places:
+        *sections, key = place.split(".")
+        inside = content
+        for section in sections:
+            inside = inside[section]
+        # Results of other versions may lack it.
+        inside.pop(key, None)
     return json.dumps(content).encode()

@@ -20,7 +20,7 @@ held = bytearray(100_000_000)
 child.wait()
 out.mkdir()
 found = {"signs": {"relative": {"total": {"mean": ERROR}}}}
-(out / "metrics.json").write_text(json.dumps({"times_s": {"mapping": 0.25}, "survey": found}))
+(out / "metrics.json").write_text(json.dumps({"times_s": {"mapping": 0.25}, "memory_gb": {"mapping": 0.1}, "survey": found}))
 """
 
 
@@ -29,6 +29,7 @@ def test_a_run_is_measured_with_all_that_it_began(tmp_path: Path):
     other = checkout(tmp_path / "other", MAIN.replace("ERROR", "0.03"))
     found = stages.measured(other, tmp_path, 2)
     assert found.stages["mapping"] == 0.25 and found.relative_m == 0.03
+    assert found.main_gb == {"mapping": 0.1}
     assert found.wall_s > 0.6 and sum(found.stages.values()) == pytest.approx(found.wall_s)
     # The process and its child together, neither alone.
     assert 0.3 < found.peak_gb < 0.5
@@ -36,7 +37,9 @@ def test_a_run_is_measured_with_all_that_it_began(tmp_path: Path):
 
 def test_states_stand_beside_each_other_with_their_medians(tmp_path: Path):
     def took(seconds: float, error: float | None) -> stages.Measured:
-        return stages.Measured({"mapping": seconds}, 2 * seconds, 3 * seconds, 1.5, error)
+        return stages.Measured(
+            {"mapping": seconds}, 2 * seconds, 3 * seconds, 1.5, {"mapping": seconds / 10}, error
+        )
 
     lines = stages.table(
         ["this one", "old"], [[took(1, 0.02), took(9, 0.04), took(2, 0.03)], [took(5, 0.05)]]
@@ -44,6 +47,7 @@ def test_states_stand_beside_each_other_with_their_medians(tmp_path: Path):
     rows = {line.split("  ")[0]: line.split()[-2:] for line in lines}
     assert rows["mapping [s]"] == ["2.0", "5.0"]
     assert rows["files to map [s]"] == ["4.0", "10.0"]
+    assert rows["of the main one, mapping [GB]"] == ["0.20", "0.50"]
     assert rows["relative error [m]"] == ["0.0300", "0.0500"]
     without = stages.table(["this one"], [[took(1, None)]])
     assert not any("relative" in line for line in without)

@@ -4,6 +4,7 @@ import io
 
 import pytest
 
+from crowdmap_torch.processes.memory import peak_bytes
 from crowdmap_torch.report import progress
 from crowdmap_torch.report.progress import Progress
 
@@ -29,6 +30,18 @@ def test_a_stage_has_the_seconds_between_its_name_and_the_next(clock):
     clock[0] = 5.0
     told.finish()
     assert told.seconds == {"read": 2.0, "map": 3.0}
+
+
+@pytest.mark.skipif(peak_bytes() is None, reason="memory is read in /proc")
+def test_a_stage_has_the_memory_that_it_held_and_not_what_one_before_it_did():
+    told = Progress(io.StringIO())
+    told("much")
+    much = bytearray(200_000_000)
+    told("little")
+    del much
+    told("less")
+    told.finish()
+    assert told.peak_gb["much"] - told.peak_gb["less"] == pytest.approx(0.2, abs=0.1)
 
 
 def test_without_a_terminal_lines_come_seldom_and_at_the_end(clock):

@@ -6,6 +6,7 @@ import torch
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.report.html import report_html
+from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.record import RunRecord, record_of
 from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.report.watch import Watch
@@ -17,9 +18,7 @@ def made(tiny: Dataset, tiny_result: MapResult, tmp_path_factory) -> RunRecord:
     """Of the tiny dataset, without a survey."""
     with TensorBoardLog(tmp_path_factory.mktemp("log")) as log:
         watch = Watch(log, None, tiny_result.first.signs, tiny_result.first.lanes)
-    return record_of(
-        tiny, tiny_result, MapperConfig(), watch, {"adjust": 1.0}, None, None, None, None
-    )
+    return record_of(tiny, tiny_result, MapperConfig(), watch, Progress(), None, None, None, None)
 
 
 def test_a_record_holds_every_journey_and_certain_signs_alone(

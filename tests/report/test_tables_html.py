@@ -73,8 +73,9 @@ def test_reasons_come_by_stage_the_most_frequent_first():
 
 
 def test_the_longest_stage_has_the_longest_bar():
-    assert timing_table({}) == ""
-    assert re.findall(r"width:([\d.]+)%\"></div>", timing_table({"a": 1.0, "b": 4.0})) == [
+    assert timing_table({}, {}) == ""
+    assert "<td>0.50 GB</td>" in timing_table({"a": 1.0, "b": 4.0}, {"b": 0.5})
+    assert re.findall(r"width:([\d.]+)%\"></div>", timing_table({"a": 1.0, "b": 4.0}, {})) == [
         *("25.0", "100.0")
     ]
 

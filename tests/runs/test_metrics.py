@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.report.iteration import Iteration
+from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.runs.metrics import metrics_of
 from crowdmap_torch.tables import Dataset
 
@@ -19,7 +21,11 @@ from crowdmap_torch.tables import Dataset
 def metrics(tiny: Dataset, tiny_result: MapResult) -> dict:
     """What metrics.json would hold of the tiny dataset's map."""
     iterations = (Iteration(1, {"sign_reprojection": 2.0, "lane": 1.0}, 1e-4, 0.9, 0.1),)
-    found = metrics_of(tiny, tiny_result, MapperConfig(), iterations, {"adjust": 1.5}, None, None)
+    told = Progress(io.StringIO())
+    told.seconds["adjust"] = 1.5
+    found = metrics_of(
+        tiny, tiny_result, MapperConfig(), iterations, told, {"again": 1}, None, None
+    )
     return json.loads(json.dumps(plain(found), allow_nan=False))
 
 
@@ -62,7 +68,7 @@ def test_scales_that_could_not_go_further_are_named(tiny: Dataset, tiny_result: 
     prior = torch.full_like(tiny_result.prior_scale, 0.8)
     prior[0, 1], prior[0, 2], white[0, 0] = 0.1, 10.0, 10.0
     result = replace(tiny_result, prior_scale=prior, white_scale=white)
-    made = metrics_of(tiny, result, MapperConfig(), (), {}, None, None)
+    made = metrics_of(tiny, result, MapperConfig(), (), Progress(), {}, None, None)
     scales = [journey["sigma_scale"] for journey in plain(made)["journeys"]]
     assert scales[0]["at_bound"] == ["drift", "rotation", "noise"]
     assert scales[0]["drift"] == 0.1 and scales[1]["drift"] == 0.8

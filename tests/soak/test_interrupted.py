@@ -41,7 +41,10 @@ def test_results_differ_by_whatever_is_no_time(tmp_path: Path) -> None:
     for path, content in (
         ("tensorboard/events", "other"),
         ("map/map.json", json.dumps({"provenance": {"created_at": "b", "b": 1}})),
-        ("metrics.json", json.dumps({"times_s": {"a": 2.0}, "counts": {"signs": 2}})),
+        (
+            "metrics.json",
+            json.dumps({"times_s": {"a": 2.0}, "counts": {"signs": 2}, "workers": {"again": 1}}),
+        ),
     ):
         (other / path).write_text(content)
     assert differences(one, other) == []

@@ -88,6 +88,7 @@ def run_folder(
     from crowdmap_torch import mapper
     from crowdmap_torch.config import MapperConfig
     from crowdmap_torch.report.outcomes import sign_outcomes
+    from crowdmap_torch.report.progress import Progress
     from crowdmap_torch.runs.folder import RunFolder
     from crowdmap_torch.runs.metrics import metrics_of
 
@@ -98,6 +99,6 @@ def run_folder(
         folder.prepare(tiny_folder)
         folder.write_result(tiny, result, config)
         with folder.publishing():
-            folder.write_metrics(metrics_of(tiny, result, config, (), {}, None, None))
+            folder.write_metrics(metrics_of(tiny, result, config, (), Progress(), {}, None, None))
             folder.keep_outcomes(sign_outcomes(tiny, result, bundle, config))
     return folder.path

@@ -1,0 +1,43 @@
+"""Tasks in processes of this machine, each on one core."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+import torch
+
+from crowdmap_torch.fleet.engine import Engine, Finished, finished
+from crowdmap_torch.processes.workers import Call, Workers
+
+
+class Processes(Engine):
+    """At most so many processes beside this one; they are begun as there are tasks for them."""
+
+    name = "processes"
+
+    def __init__(self, workers: int) -> None:
+        super().__init__()
+        self._pool = Workers(workers, torch.set_num_threads, 1)
+
+    @property
+    def free(self) -> int:
+        """Processes that are there or may be begun, and do nothing."""
+        return self._pool.free
+
+    def submit(self, number: int, call: Call) -> None:
+        """Hands a task to a process."""
+        name, function, arguments = call
+        self._pool.start(number, (name, finished, (function, arguments)))
+
+    def gather(self) -> list[tuple[int, Finished]]:
+        """Waits for a process."""
+        return self._pool.wait()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Ends the processes."""
+        self._pool.__exit__(kind, error, traceback)
