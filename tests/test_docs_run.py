@@ -41,6 +41,8 @@ NOT_RUN: Mapping[str, str] = {
     "make soak": "takes hours; its three commands are run, in small",
     "python scripts/soak.py mended": "maps a data set three times: half a minute in its smallest form",
     "python scripts/soak.py signals": "maps for a minute; test_interrupted.py does the same by SIGKILL",
+    "crowdmap optimize /data/city --out /data/run --engine ray --address FIRST:6379": "needs a cluster",
+    "crowdmap optimize --engine ray --address HOST:PORT": "needs a cluster",
     "pip install torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu": "needs a network",
     "pip install -c constraints.txt .": "needs a network",
 }

@@ -33,7 +33,7 @@ from crowdmap_torch.soak.child import children, ends
 from crowdmap_torch.soak.interrupted import differences
 
 ROUGH = """\
-adjust: {lm: {max_iterations: 6}, covariance_samples: 4}
+adjust: {lm: {max_iterations: 6}}
 sign_triangulation: {fit: {rounds: 1, lm: {max_iterations: 6}, coarse_lm: {max_iterations: 3}}}
 crowd: {rounds: 1}
 """
