@@ -13,7 +13,8 @@ from crowdmap_torch.io.datasets import load_journey, read_origin
 from crowdmap_torch.io.documents import read_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.landmarks import read_lanes, read_signs
-from crowdmap_torch.io.maps import read_map, read_map_head
+from crowdmap_torch.io.map_heads import read_map_head
+from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.io.truth import (
     SignAssociations,
     Truth,

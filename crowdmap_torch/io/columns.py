@@ -52,7 +52,7 @@ class Sheet:
 
     def __init__(self, path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> None:
         self.path = path
-        self._table, missing = _read(path, required, optional)
+        self._table, missing = read_columns(path, required, optional)
         self._wrong: dict[str, Bool[np.ndarray, " n"]] = {}
         for name, rule in missing.items():
             self._keep(rule, "missing-column", np.zeros(0, dtype=np.int64), name)
@@ -350,7 +350,7 @@ _EMPTY = {
 }
 
 
-def _read(
+def read_columns(
     path: Path, required: Sequence[str], optional: Sequence[str]
 ) -> tuple[pa.Table, dict[str, str]]:
     """What a file has of the columns; and what is to be said of each that is missing, where faults are gathered."""

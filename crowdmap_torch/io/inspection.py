@@ -23,13 +23,14 @@ from crowdmap_torch.io.datasets import (
     refuse_no_journey,
 )
 from crowdmap_torch.io.detections import read_lane_detections, read_sign_detections
-from crowdmap_torch.io.documents import read_json
+from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.faults import Fault, attempted, gathered, gathering
-from crowdmap_torch.io.maps import read_map_head
+from crowdmap_torch.io.map_heads import read_map_head
 from crowdmap_torch.io.poses import read_poses
 from crowdmap_torch.io.rigs import MAX_SIDE_PX, faults_of_rig, missing_rig
 from crowdmap_torch.io.surveys import read_surveyed_lanes, read_surveyed_signs, survey_files
+from crowdmap_torch.io.tiled_sheets import path_of
 from crowdmap_torch.tables import Origin
 
 
@@ -139,24 +140,29 @@ def _of_survey(folder: Path) -> None:
     survey = folder / "survey"
     if not survey.exists():
         return
-    with attempted(survey / "map.json"):
-        _survey_head(survey, folder / "dataset.json")
+    head, told = Document(survey / "map.json", {}), len(gathered() or ())
+    with attempted(head.path):
+        head = read_map_head(survey)
+        _survey_head(head, folder / "dataset.json")
+    if len(gathered() or ()) > told and (survey / "tiles").is_dir():
+        # Without index and origin nobody knows what belongs in which tile.
+        return
     with attempted(survey):
-        signs, lanes = survey_files(survey)
+        signs, lanes = survey_files(survey, head)
         if signs is not None:
-            with attempted(signs):
+            with attempted(path_of(signs)):
                 read_surveyed_signs(signs)
         if lanes is not None:
-            with attempted(lanes):
+            with attempted(path_of(lanes)):
                 read_surveyed_lanes(lanes)
 
 
-def _survey_head(survey: Path, dataset: Path) -> None:
+def _survey_head(head: Document, dataset: Path) -> None:
     told = len(gathered() or ())
-    found, expected = read_origin(read_map_head(survey)), _origin_of(dataset)
+    found, expected = read_origin(head), _origin_of(dataset)
     if len(gathered() or ()) == told and expected is not None and not expected.is_same(found):
         rule = f"origin: {found}; expected that of dataset.json, {expected}"
-        raise InputError(f"{survey / 'map.json'}: {rule}", "value")
+        raise InputError(f"{head.path}: {rule}", "value")
 
 
 def _origin_of(dataset: Path) -> Origin | None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from crowdmap_torch.geometry import polygon, se3, spline_length
 from crowdmap_torch.io.columns import MAX_PLACE_M, Sheet
 from crowdmap_torch.io.rigs import UNIT_TOLERANCE
+from crowdmap_torch.io.tiled_sheets import TiledFile, opened
 from crowdmap_torch.io.writing import (
     list_column,
     name_column,
@@ -90,13 +91,13 @@ def write_lanes(path: Path, lanes: Lanes, lane_id: Sequence[str]) -> None:
     )
 
 
-def read_signs(path: Path) -> tuple[Signs, tuple[str, ...], tuple[str, ...]]:
+def read_signs(path: Path | TiledFile) -> tuple[Signs, tuple[str, ...], tuple[str, ...]]:
     """Signs, their ids and the traffic-sign codes that the `type` column counts.
 
     Only the columns `sign_id`, `shape` and `corners` must be there: a survey can be read as a map.
     """
     optional = ("type", "center", "normal", "width_m", "height_m", "covariance", "sigma_m")
-    sheet = Sheet(path, ("sign_id", "shape", "corners"), (*optional, *_SUPPORT, "confidence"))
+    sheet = opened(path, ("sign_id", "shape", "corners"), (*optional, *_SUPPORT, "confidence"))
     sign_id = sheet.ids("sign_id")
     shape = torch.from_numpy(sheet.codes("shape", polygon.SHAPES))
     corners, known = read_corners(sheet, shape)
@@ -123,13 +124,13 @@ def read_signs(path: Path) -> tuple[Signs, tuple[str, ...], tuple[str, ...]]:
     return signs, sign_id, type_names
 
 
-def read_lanes(path: Path) -> tuple[Lanes, tuple[str, ...]]:
+def read_lanes(path: Path | TiledFile) -> tuple[Lanes, tuple[str, ...]]:
     """Pieces of lane markers and their ids.
 
     Only the columns `lane_id` and `points` must be there; they then stand for the control points.
     """
     optional = ("type", "control_points", "sigma_m", *_SUPPORT, "confidence")
-    sheet = Sheet(path, ("lane_id", "points"), optional)
+    sheet = opened(path, ("lane_id", "points"), optional)
     lane_id = sheet.ids("lane_id")
     name = "control_points" if "control_points" in sheet else "points"
     control = sheet.point_lists(name)

@@ -11,17 +11,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.geometry import polygon
+from crowdmap_torch.io.area import Area
 from crowdmap_torch.io.atomic import atomic_folder
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.columns import MAX_PLACE_M
 from crowdmap_torch.io.datasets import read_origin
-from crowdmap_torch.io.documents import Document, read_json, write_json
-from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.documents import write_json
 from crowdmap_torch.io.landmark_ids import lane_ids, sign_ids
 from crowdmap_torch.io.landmarks import read_lanes, read_signs, write_lanes, write_signs
+from crowdmap_torch.io.map_heads import MAP_FORMAT, read_map_head
+from crowdmap_torch.io.tiled_maps import split_map
+from crowdmap_torch.io.tiled_sheets import TiledFile, landmark_file
 from crowdmap_torch.tables import Association, Dataset, HdMap, Lanes, Signs, concatenate
 
-MAP_FORMAT = "crowdmap-map"
 MIN_CONFIDENCE = 0.5
 """Signs that are less probable than this are tentative."""
 
@@ -58,10 +60,17 @@ def certain_part(hd_map: HdMap, min_confidence: float) -> HdMap:
     return replace(hd_map, signs=hd_map.signs[kept], sign_id=names)
 
 
-def write_map(hd_map: HdMap, path: Path | str, *, min_confidence: float = MIN_CONFIDENCE) -> None:
+def write_map(
+    hd_map: HdMap,
+    path: Path | str,
+    *,
+    min_confidence: float = MIN_CONFIDENCE,
+    tile_level: int | None = None,
+) -> None:
     """Writes a map; an older one at `path` stays untouched until the new one is complete.
 
-    Signs less probable than `min_confidence` go to `tentative_signs.parquet`.
+    Signs less probable than `min_confidence` go to `tentative_signs.parquet`. With `tile_level` the map is in tiles of that
+    level of `geometry.quadtree`.
     """
     with atomic_folder(Path(path)) as folder:
         signs = hd_map.signs.to("cpu")
@@ -81,27 +90,33 @@ def write_map(hd_map: HdMap, path: Path | str, *, min_confidence: float = MIN_CO
                 "provenance": hd_map.provenance,
             },
         )
+        if tile_level is not None:
+            split_map(folder, tile_level)
 
 
-def read_map(path: Path | str) -> HdMap:
-    """A map with its certain signs; InputError for what breaks FORMAT.md.
+def read_map(path: Path | str, *, area: Area | None = None) -> HdMap:
+    """A map with its certain signs, in one piece or in tiles; InputError for what breaks FORMAT.md.
 
     What a survey may leave out is filled in: no observations, confidence 1, the default sigma, no
-    shared part.
+    shared part. With `area` the signs whose centre is inside alone, and the lane pieces with a control point inside;
+    of a map in tiles only those are read that hold something there.
     """
     folder = Path(path)
     with reading(inside=folder):
-        return _read_map(folder)
+        return _read_map(folder, area)
 
 
-def _read_map(folder: Path) -> HdMap:
+def _read_map(folder: Path, area: Area | None) -> HdMap:
     head = read_map_head(folder)
     shared = [0.0] * 9
     if "shared_covariance" in head.content:
         shared = head.numbers("shared_covariance", 9, most=MAX_PLACE_M**2)
-    signs, sign_id, type_names = read_signs(folder / "signs.parquet")
-    lanes, lane_id = read_lanes(folder / "lanes.parquet")
-    return HdMap(
+    sources = [landmark_file(folder, head, kind) for kind in ("signs", "lanes")]
+    if area is not None:
+        sources = [s.touching(area) if isinstance(s, TiledFile) else s for s in sources]
+    signs, sign_id, type_names = read_signs(sources[0])
+    lanes, lane_id = read_lanes(sources[1])
+    hd_map = HdMap(
         origin=read_origin(head),
         signs=signs,
         lanes=lanes,
@@ -111,13 +126,24 @@ def _read_map(folder: Path) -> HdMap:
         shared_covariance=torch.tensor(shared, dtype=torch.float64).reshape(3, 3),
         provenance=head.part("provenance").content if "provenance" in head.content else {},
     )
+    return hd_map if area is None else _part(hd_map, area)
 
 
-def read_map_head(folder: Path) -> Document:
-    """The `map.json` of a map or survey, its format checked."""
-    if not folder.is_dir():
-        rule = f"{folder}: the map's folder is missing; expected map.json in it"
-        raise InputError(rule, "missing-file")
-    head = read_json(folder / "map.json")
-    head.require_format(MAP_FORMAT)
-    return head
+def _part(hd_map: HdMap, area: Area) -> HdMap:
+    """What of a map lies in an area; codes of signs are those that its signs have."""
+    signs, lanes = hd_map.signs, hd_map.lanes
+    kept = area.holds(signs.center_world).nonzero()[:, 0]
+    near = torch.zeros(len(lanes), dtype=torch.bool)
+    piece = torch.arange(len(lanes)).repeat_interleave(lanes.control_count)
+    near[piece[area.holds(lanes.control.point_world)]] = True
+    pieces = near.nonzero()[:, 0]
+    code, type_of = signs.type[kept].unique(return_inverse=True)
+    known = code[code >= 0].tolist()
+    return replace(
+        hd_map,
+        signs=replace(signs[kept], type=type_of - int((code < 0).sum())),
+        lanes=lanes.select(pieces),
+        sign_id=tuple(hd_map.sign_id[k] for k in kept.tolist()),
+        lane_id=tuple(hd_map.lane_id[k] for k in pieces.tolist()),
+        type_names=tuple(hd_map.type_names[k] for k in known),
+    )

@@ -10,11 +10,12 @@ import torch
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io.budget import reading
-from crowdmap_torch.io.columns import Sheet
 from crowdmap_torch.io.datasets import read_origin
+from crowdmap_torch.io.documents import Document
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.landmarks import center_of, read_corners, read_normals, read_sigma
-from crowdmap_torch.io.maps import read_map_head
+from crowdmap_torch.io.map_heads import read_map_head
+from crowdmap_torch.io.tiled_sheets import TiledFile, landmark_file, opened
 from crowdmap_torch.tables import LANE_TYPES, Survey, SurveyLanePoints, SurveySigns
 
 
@@ -27,7 +28,7 @@ def read_survey(path: Path | str) -> Survey:
 
 def _read_survey(folder: Path) -> Survey:
     head = read_map_head(folder)
-    signs_path, lanes_path = survey_files(folder)
+    signs_path, lanes_path = survey_files(folder, head)
     sign_id, signs = read_surveyed_signs(signs_path) if signs_path else ((), _no_signs())
     lane_id, lane_type, lane_points = (), _integers(), _no_points()
     if lanes_path:
@@ -42,19 +43,24 @@ def _read_survey(folder: Path) -> Survey:
     )
 
 
-def survey_files(folder: Path) -> tuple[Path | None, Path | None]:
+def survey_files(
+    folder: Path, head: Document
+) -> tuple[Path | TiledFile | None, Path | TiledFile | None]:
     """Its files of signs and of lanes, None for one that is not there; InputError if there is neither."""
-    paths = folder / "signs.parquet", folder / "lanes.parquet"
-    signs, lanes = (path if os.path.lexists(path) else None for path in paths)
+    sources = [landmark_file(folder, head, kind) for kind in ("signs", "lanes")]
+    signs, lanes = (
+        source if isinstance(source, TiledFile) or os.path.lexists(source) else None
+        for source in sources
+    )
     if signs is None and lanes is None:
         rule = f"{folder}: has neither signs.parquet nor lanes.parquet; expected one"
         raise InputError(rule, "missing-file")
     return signs, lanes
 
 
-def read_surveyed_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
+def read_surveyed_signs(path: Path | TiledFile) -> tuple[tuple[str, ...], SurveySigns]:
     """Names of signs and where they are, by name. Where faults are gathered all are, and the signs are worth nothing."""
-    sheet = Sheet(path, ("sign_id", "shape"), ("corners", "center", "normal", "sigma_m"))
+    sheet = opened(path, ("sign_id", "shape"), ("corners", "center", "normal", "sigma_m"))
     sign_id = sheet.ids("sign_id")
     shape = torch.from_numpy(sheet.codes("shape", polygon.SHAPES))
     corners, has_corners = read_corners(sheet, shape, optional=True)
@@ -79,9 +85,11 @@ def read_surveyed_signs(path: Path) -> tuple[tuple[str, ...], SurveySigns]:
     return tuple(sign_id[k] for k in order), signs[torch.tensor(order, dtype=torch.int64)]
 
 
-def read_surveyed_lanes(path: Path) -> tuple[tuple[str, ...], torch.Tensor, SurveyLanePoints]:
+def read_surveyed_lanes(
+    path: Path | TiledFile,
+) -> tuple[tuple[str, ...], torch.Tensor, SurveyLanePoints]:
     """Names of lane markers, their types and points, by name; faults as of signs."""
-    sheet = Sheet(path, ("lane_id", "points"), ("type",))
+    sheet = opened(path, ("lane_id", "points"), ("type",))
     lane_id = sheet.ids("lane_id")
     points = sheet.point_lists("points")
     sheet.refuse(

@@ -14,7 +14,7 @@ from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io.documents import write_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.formats.composing.parts import SurveyRows
-from crowdmap_torch.io.maps import MAP_FORMAT
+from crowdmap_torch.io.map_heads import MAP_FORMAT
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.writing import name_column, points_column, write_parquet
 from crowdmap_torch.tables import LANE_TYPES, Origin, Survey
