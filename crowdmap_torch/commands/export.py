@@ -1,15 +1,14 @@
 """Writes a map in a format of others: `crowdmap export MAP --to FORMAT [-o FILE] [--overwrite]`.
 
 MAP is a map, a survey whose signs have corners, or a RUN, whose map is taken; `tum` and `kitti` write the refined poses of a
-RUN, into a folder. What the format has no place for is said in a line each.
+RUN, into a folder. What the format has no place for is said in a line each. `tiles` and `map` write FORMAT.md's own two
+forms of a map, with everything that is in it.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-
-import pyarrow.parquet as pq
 
 from crowdmap_torch.io.errors import InputError, input_read
 from crowdmap_torch.io.formats.exporters.export import (
@@ -22,6 +21,15 @@ from crowdmap_torch.io.formats.exporters.export import (
     names,
 )
 from crowdmap_torch.io.maps import read_map
+from crowdmap_torch.io.tiled_maps import DEFAULT_LEVEL, TileLevel, rewrite_map, tentative_count
+from crowdmap_torch.ranges import argument
+
+_FORMS = {
+    "tiles": ExportFormat("map in tiles", ".tiles", is_folder=True),
+    "map": ExportFormat("map in one piece", ".map", is_folder=True),
+}
+"""Of FORMAT.md's own maps."""
+_MAP_NAMES = ("map.json", "signs.parquet", "tentative_signs.parquet", "lanes.parquet", "tiles")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP", help="a map, a survey, or a RUN")
     titles = [f"{name}: {form.title}" for name, form in (FORMATS | TRAJECTORIES).items()]
     titles += [f"{name}: of another package" for name in names() if name not in FORMATS]
-    choices = [*names(), *TRAJECTORIES]
+    titles += [f"{name}: {form.title}" for name, form in _FORMS.items()]
+    choices = [*names(), *TRAJECTORIES, *_FORMS]
     parser.add_argument(
         "--to", required=True, choices=choices, metavar="FORMAT", help="; ".join(titles)
     )
@@ -37,6 +46,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--out", type=Path, metavar="FILE", help="default: beside MAP, named after it"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a FILE that exists")
+    parser.add_argument(
+        "--level",
+        type=argument(TileLevel),
+        default=DEFAULT_LEVEL,
+        metavar="L",
+        help=f"of --to tiles (default: {DEFAULT_LEVEL})",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -44,20 +60,36 @@ def run(options: argparse.Namespace) -> None:
     if options.to in TRAJECTORIES:
         _run_trajectories(options, TRAJECTORIES[options.to])
         return
+    if options.to in _FORMS:
+        _run_form(options, _FORMS[options.to])
+        return
     form = form_of(options.to)
     folder = _map_folder(options.map)
     out = options.out or folder.resolve().with_name(f"{folder.resolve().name}{form.ending}")
     _require_free(out, folder, form, options.overwrite)
     with input_read():
         hd_map = read_map(folder)
-        tentative = folder / "tentative_signs.parquet"
-        left = pq.read_metadata(tentative).num_rows if tentative.is_file() else 0
+        left = tentative_count(folder)
     losses = export_map(hd_map, out, options.to)
     print(f"{form.title}: {out}: {len(hd_map.signs)} signs, {len(hd_map.lanes)} lane pieces")
     if left:
         losses = (f"{left} tentative signs, which are not part of the map", *losses)
     for loss in losses:
         print(f"left out: {loss}")
+
+
+def _run_form(options: argparse.Namespace, form: ExportFormat) -> None:
+    folder = _map_folder(options.map)
+    out = options.out or folder.resolve().with_name(f"{folder.resolve().name}{form.ending}")
+    _require_free(out, folder, form, options.overwrite)
+    with input_read():
+        level = options.level if options.to == "tiles" else None
+        counts = rewrite_map(folder, out, level=level)
+    told = [f"{count} {kind.replace('_', ' ')}" for kind, count in counts.items()]
+    print(f"{form.title}: {out}: {', '.join(told)}")
+    for path in sorted(folder.iterdir()):
+        if path.name not in _MAP_NAMES:
+            print(f"left out: {path.name}, which is not part of the map")
 
 
 def _run_trajectories(options: argparse.Namespace, form: ExportFormat) -> None:
@@ -85,7 +117,9 @@ def _require_free(out: Path, folder: Path, form: ExportFormat, overwrite: bool) 
         raise InputError(f"{out}: holds the map {folder}; choose a place outside it")
     if out.is_dir() and not form.is_folder:
         raise InputError(f"{out}: a folder; expected the name of a file")
-    if out.is_dir() and any(file.suffix != form.ending for file in out.iterdir()):
+    known = _MAP_NAMES if form in _FORMS.values() else ()
+    others = [] if not out.is_dir() else [p for p in out.iterdir() if p.name not in known]
+    if any(file.suffix != form.ending for file in others):
         raise InputError(f"{out}: a folder with other files in it; choose another name")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists; choose another name or give --overwrite")

@@ -41,6 +41,7 @@ from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.errors import InputError, input_read, needing, one_line
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.stored_drives import stored_drives
+from crowdmap_torch.io.tiled_maps import DEFAULT_LEVEL, TileLevel
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.plausibility.dataset import look_over
@@ -102,6 +103,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_area,
         metavar="E0,N0,E1,N1",
         help="map what drives saw from inside this area alone [m east and north of the origin]",
+    )
+    parser.add_argument(
+        "--tiles",
+        type=argument(TileLevel),
+        nargs="?",
+        const=DEFAULT_LEVEL,
+        metavar="LEVEL",
+        help=f"write the map in tiles of HERE's and NDS's grid (level {DEFAULT_LEVEL} without LEVEL)",
     )
     parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
     parser.add_argument(
@@ -217,7 +226,7 @@ def _map(
         watch.finish(bundle, result.hd_map)
     # What follows is written and drawn: on the CPU, wherever it was made.
     dataset, result = to_device((dataset, result), "cpu")
-    folder.write_result(dataset, result, config)
+    folder.write_result(dataset, result, config, tile_level=options.tiles)
 
     # ---- its errors against the survey, the report ----
     with folder.publishing():

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from crowdmap_torch.geometry.quadtree import MAX_LEVEL
 from crowdmap_torch.io.atomic import atomic_folder
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.columns import Sheet
@@ -26,10 +28,12 @@ from crowdmap_torch.io.tiled_sheets import (
     refuse_unlike,
     tile_names,
 )
+from crowdmap_torch.ranges import Range
 from crowdmap_torch.tables import Origin
 
+TileLevel = Annotated[int, Range(1, MAX_LEVEL, "levels of the quadtree of tiles")]
 DEFAULT_LEVEL = 14
-"""Tiles of 2.4 km from south to north, as HERE's and NDS's lanes are kept in: some megabytes each, a few for a town."""
+"""Tiles of 2.4 km from south to north: finer ones cost bytes and files (SCALE.md), as every tile has all kinds of them."""
 
 
 def split_map(folder: Path, level: int) -> None:
@@ -126,6 +130,14 @@ def _copy_whole(folder: Path, to: Path) -> dict[str, int]:
     told = {key: value for key, value in head.content.items() if key != "tiles"}
     write_json(to / "map.json", told)
     return counts
+
+
+def tentative_count(folder: Path) -> int:
+    """How many signs of a map are tentative."""
+    source = landmark_file(folder, read_map_head(folder), "tentative_signs")
+    if isinstance(source, TiledFile):
+        return sum(tile.counts[source.kind] for tile in source.tiles)
+    return pq.read_metadata(source).num_rows if source.is_file() else 0
 
 
 def _whole(source: Path | TiledFile) -> pa.Table:

@@ -41,6 +41,7 @@ _MAP_FILES = ("map.json", "signs.parquet", "tentative_signs.parquet", "lanes.par
 _MADE = (
     *_MAKES,
     *(f"{name}/{file}" for name in ("map", "map_clusters") for file in _MAP_FILES),
+    *(f"map/tiles/*/{file}" for file in _MAP_FILES[1:]),
     *(f"journeys/*/{name}.parquet" for name in ("poses", "signs", "lanes", "road")),
     "tensorboard/events.out.tfevents.*",
     *("rigs/*/rig.yaml", "rigs/*/rig.urdf"),
@@ -144,8 +145,18 @@ class RunFolder:
             return f"nothing is left of the run{older}"
         return f"what was finished is kept: the same command with --resume goes on{older}"
 
-    def write_result(self, dataset: Dataset, result: MapResult, config: MapperConfig) -> None:
-        """The maps, what each journey made, the associations and the configuration, not in their place yet."""
+    def write_result(
+        self,
+        dataset: Dataset,
+        result: MapResult,
+        config: MapperConfig,
+        *,
+        tile_level: int | None = None,
+    ) -> None:
+        """The maps, what each journey made, the associations and the configuration, not in their place yet.
+
+        With `tile_level` the map is in tiles; that of the clusters never is.
+        """
         provenance = {
             **result.hd_map.provenance,
             "version": __version__,
@@ -164,11 +175,15 @@ class RunFolder:
         write_found(self.unfinished, dataset, result.uncertainty.calibration)
         with atomic_file(self.unfinished / "config.yaml") as beside:
             beside.write_text(dump(config), encoding="utf-8")
-        for name, hd_map in (("map_clusters", result.map_clusters), ("map", result.hd_map)):
+        for name, hd_map, level in (
+            ("map_clusters", result.map_clusters, None),
+            ("map", result.hd_map, tile_level),
+        ):
             write_map(
                 replace(hd_map, provenance=provenance),
                 self.unfinished / name,
                 min_confidence=config.min_confidence,
+                tile_level=level,
             )
 
     def keep_outcomes(self, outcomes: NamedOutcomes) -> NamedOutcomes:
