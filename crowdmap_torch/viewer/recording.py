@@ -28,6 +28,8 @@ from crowdmap_torch.viewer.scene import Drive, Scene, frame_quaternions
 _CHI95 = 7.815**0.5
 """Half axes of the ellipsoid that three numbers are in with 95 %, in sigmas."""
 _LANE_STEP_M = 1.0
+_NEAR_M = 20.0
+"""How far the eye is from the middle at least."""
 _PLATES = {
     "octagon": 0xC3202FFF,
     "triangle": 0xE8505CFF,
@@ -67,14 +69,34 @@ def rerun_sdk() -> ModuleType:
 
 
 def _layout(rerun: ModuleType, scene: Scene):
-    """The world beside the picture of the first drive."""
+    """The world, from above, beside the picture of the first drive."""
     of = rerun.blueprint
-    views = [of.Spatial3DView(origin="world", name="map")]
+    views = [of.Spatial3DView(origin="world", name="map", eye_controls=_eye(rerun, scene))]
     if scene.journeys:
         first = scene.journeys[0].journey_id
         origin = rerun.new_entity_path([*_of_drive(first), "camera"])
         views.append(of.Spatial2DView(origin=origin, name=first))
     return of.Blueprint(of.Horizontal(*views))
+
+
+def _eye(rerun: ModuleType, scene: Scene):
+    """An eye that looks down on the whole from the south, north ahead; by itself rerun begins amid the signs."""
+    maps = [one for one in (scene.hd_map, scene.survey) if one is not None]
+    places = [drive.path_world for drive in scene.drives]
+    places += [place for one in maps for place in (one.signs.center_world, _lane_places(one))]
+    points = torch.cat([torch.zeros(0, 3, dtype=torch.double), *places])
+    if not len(points):
+        return None
+    low, high = points.amin(0), points.amax(0)
+    middle, away = (low + high) / 2, max(float((high - low)[:2].max()), _NEAR_M)
+    eye = middle + away * torch.tensor([0.0, -0.4, 0.9], dtype=torch.double)
+    return rerun.blueprint.EyeControls3D(
+        position=eye.tolist(), look_target=middle.tolist(), eye_up=(0.0, 0.0, 1.0)
+    )
+
+
+def _lane_places(of: HdMap | Survey) -> Float[Tensor, "n 3"]:
+    return of.lanes.control.point_world if isinstance(of, HdMap) else of.lane_points.point_world
 
 
 def _of_drive(journey_id: str) -> list[str]:

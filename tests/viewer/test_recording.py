@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +29,26 @@ class Recording:
     """Columns of a recording by entity, a list a row."""
 
     def __init__(self, path: Path) -> None:
-        chunks = importlib.import_module("rerun.chunk").RrdReader(str(path)).stream()
-        self.entities: dict[str, dict[str, list[Any]]] = {}
-        for chunk in chunks:
-            batch = chunk.to_record_batch()
-            own = self.entities.setdefault(chunk.entity_path, {})
-            for name in batch.schema.names:
-                own.setdefault(name, []).extend(batch.column(name).to_pylist())
+        reader = importlib.import_module("rerun.chunk").RrdReader(str(path))
+        self.entities = columns_of(reader.stream())
+        (blueprint,) = reader.blueprints()
+        self.layout = columns_of(reader.stream(store=blueprint))
 
     def one(self, entity: str, column: str) -> list[Any]:
         """What was logged once."""
         (value,) = self.entities[entity][column]
         return value
+
+
+def columns_of(chunks: Iterable[Any]) -> dict[str, dict[str, list[Any]]]:
+    """The columns of a stream of chunks by entity."""
+    entities: dict[str, dict[str, list[Any]]] = {}
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        own = entities.setdefault(chunk.entity_path, {})
+        for name in batch.schema.names:
+            own.setdefault(name, []).extend(batch.column(name).to_pylist())
+    return entities
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +79,24 @@ def test_signs_are_where_the_map_has_them(recording: Recording, adjusted: Scene)
     # Fans of both sides, and none reaches from one plate to another.
     assert len(triangles) == 2 * int((mask.sum(1) - 2).sum())
     assert all(len({k // 8 for k in triangle}) == 1 for triangle in triangles)
+
+
+@needs_rerun
+def test_it_opens_on_the_whole_map_from_above(recording: Recording, adjusted: Scene) -> None:
+    eyes = [of for name, of in recording.layout.items() if name.endswith("/EyeControls3D")]
+    assert len(eyes) == 1
+    eye, target, up = (
+        torch.tensor(eyes[0][f"EyeControls3D:{part}"]).double().flatten()
+        for part in ("position", "look_target", "eye_up")
+    )
+    assert up.tolist() == [0, 0, 1]
+    view = torch.nn.functional.normalize(target - eye, dim=0)
+    assert view[2] < -0.9 and view[1] > 0 and abs(view[0]) < 1e-6
+    # Whatever is in the map is ahead, within 45 degrees of where the eye looks.
+    assert adjusted.hd_map is not None
+    places = [adjusted.hd_map.signs.center_world, *(d.path_world for d in adjusted.drives)]
+    rays = torch.nn.functional.normalize(torch.cat(places) - eye, dim=1)
+    assert (rays @ view).min() > 0.5**0.5
 
 
 @needs_rerun
