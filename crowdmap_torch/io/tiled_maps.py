@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -70,11 +71,16 @@ class _Cut:
     """A file of a map, and the tile of each of its rows."""
 
     table: pa.Table
-    names: np.ndarray
     bounds: np.ndarray
+    rows: dict[str, np.ndarray]
+    """By tile, ascending."""
+
+    @property
+    def names(self) -> Collection[str]:
+        return self.rows.keys()
 
     def rows_of(self, name: str) -> np.ndarray:
-        return np.flatnonzero(self.names == name)
+        return self.rows.get(name, np.zeros(0, dtype=np.int64))
 
     def table_of(self, name: str) -> pa.Table:
         rows = pa.array(self.rows_of(name), pa.int64())
@@ -90,8 +96,11 @@ def _cut(path: Path, kind: str, origin: Origin, level: int) -> _Cut:
     table = _read(path)
     if "row" in table.column_names:
         raise sheet.fault("column 'row' is there; tiles keep the order of a map in it: rename it")
-    names = np.array(tile_names(place, origin, level), dtype=object)
-    return _Cut(table, names, np.concatenate((low, high), axis=-1))
+    names, tile = np.unique(np.array(tile_names(place, origin, level)), return_inverse=True)
+    order = np.argsort(tile, kind="stable")
+    parts = np.split(order, np.searchsorted(tile[order], np.arange(1, len(names))))
+    rows = dict(zip(names.tolist(), parts, strict=False))
+    return _Cut(table, np.concatenate((low, high), axis=-1), rows)
 
 
 def _bounds(bounds: list[np.ndarray]) -> list[float]:
