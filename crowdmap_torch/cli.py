@@ -69,6 +69,11 @@ def main(arguments: Sequence[str] | None = None, *, last: bool = False) -> int:
         except OSError as error:
             say(f"{_reason(error)}; {kept()}")
             code = 1
+        except (MemoryError, RuntimeError) as error:
+            if not _is_of_memory(error):
+                raise
+            say(f"not enough memory; {kept()}. {_SMALLER}")
+            code = 1
         fault = streams.output_fault()
         if isinstance(fault, BrokenPipeError):
             code = code or _OUTPUT_UNREAD
@@ -83,6 +88,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     add_subcommands(parser, "crowdmap_torch.commands", COMMANDS)
     return parser
+
+
+def _is_of_memory(error: Exception) -> bool:
+    """Whether memory was asked for that is not there, by Python, by torch on the CPU or on a GPU."""
+    told = str(error)
+    return isinstance(error, MemoryError) or any(piece in told for piece in _OUT_OF_MEMORY)
+
+
+_OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
+_SMALLER = "Take a part of the drives (--journeys, --bbox), fewer --workers, or a larger machine"
 
 
 def _reason(error: OSError) -> str:

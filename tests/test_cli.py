@@ -8,9 +8,11 @@ import runpy
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from worlds.programs import PATIENCE_S, begin
 
 from crowdmap_torch import __version__, benchmark, studies
@@ -162,6 +164,25 @@ def test_a_full_disk_is_one_line_and_one(
     assert error == (
         "crowdmap benchmark cluster: some/map: No space left on device; nothing half-written is left\n"
     )
+
+
+def no_memory_of_python() -> None:
+    raise MemoryError
+
+
+def no_memory_of_torch() -> None:
+    torch.empty(2**55, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("lacking", [no_memory_of_python, no_memory_of_torch])
+def test_too_little_memory_is_one_line_and_one(
+    lacking: Callable[[], None], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("crowdmap_torch.benchmark.cluster.run", lambda options: lacking())
+    assert main(["benchmark", "cluster"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("crowdmap benchmark cluster: not enough memory; nothing half-written")
+    assert "--bbox" in error and error.count("\n") == 1
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")

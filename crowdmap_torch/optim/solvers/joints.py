@@ -61,9 +61,9 @@ class Joints:
         self, chain: Int[Tensor, " m"], other: Int[Tensor, " m"]
     ) -> Float[Tensor, "m q q"]:
         """The covariance of chains' joints with those of others of their drive."""
-        of_drive = self.covariance[self.drive[chain]]
-        rows = of_drive.gather(1, self.entry[chain][:, :, None].expand(-1, -1, of_drive.shape[2]))
-        return rows.gather(2, self.entry[other][:, None].expand(-1, rows.shape[1], -1))
+        # A drive's matrix is not copied once for each chain's row: drives have many joints and many rows.
+        row, column = self.entry[chain][:, :, None], self.entry[other][:, None]
+        return self.covariance[self.drive[chain][:, None, None], row, column]
 
 
 def joints_of(
