@@ -69,14 +69,14 @@ def fill_chain(
 
 def leads_of(
     rounds: Sequence[Round], diagonal: Float[Tensor, "p k k"], link: Float[Tensor, "p k k"]
-) -> list[Lead]:
+) -> tuple[Lead, ...]:
     """What all rounds leave behind of themselves; the blocks, by place, are changed."""
     leads = []
     for of_round in rounds:
         lead = lead_of(of_round, diagonal, link)
         fill_chain(of_round, lead.square(), diagonal, link)
         leads.append(lead)
-    return leads
+    return tuple(leads)
 
 
 def solve_rounds(

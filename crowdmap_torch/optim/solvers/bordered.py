@@ -96,32 +96,33 @@ class BorderedNormalEquations:
         return self.inner.structure.border
 
     def solve(self, damping: Float[Tensor, " 1"]) -> Step:
-        """The damped step: that of chains and landmarks with the border held, the border's, and what it changes."""
-        held = self.inner.solve(damping)
-        still = {**held.delta, **self.layout.unpack(torch.zeros_like(self.gradient)[None])}
-        if not bool(held.solved):
-            return failed_step(still, self.cost)
+        """The damped step: the border's first, then the landmarks' and the chains'."""
+        inner = self.inner
+        added_x, added_y = inner.damped_by(damping)
+        right_side = inner.factorise(added_x, added_y)
+        if right_side is None:
+            return self._failed()
         added = damping * self.hessian.diagonal().clamp_min(DIAGONAL_FLOOR)
         reduced = self._reduced(added)
         factor, failed = torch.linalg.cholesky_ex(reduced.T)
         if bool(failed) or not bool(reduced.T.isfinite().all()):
-            return failed_step(still, self.cost)
-        structure, entry = self.inner.structure, self._entries()
-        x = structure.stack(held.delta)
-        y = structure.where.pack(held.delta)[0]
-        right_side = self.gradient.index_add(
-            0, entry.flatten(), self._by_chain(x[..., None])[..., 0].flatten()
-        )
-        right_side = right_side + self.beside.mT @ y
-        z = -torch.cholesky_solve(right_side[:, None], factor)[:, 0]
-        change = reduced.landmarks @ z
-        product = (self.link @ z[entry][structure.owner][..., None])[..., 0]
-        product = product + self.inner.couple_back(change)
-        x = x - self.inner.solve_eliminated(product[..., None])[..., 0]
-        y = y + change
-        delta = {**self.inner.unpack(x, y), **self.layout.unpack(z[None])}
-        parts = self.inner.step_parts(x, y, *self.inner.damped_by(damping))
+            return self._failed()
+        # With the border held, F^T u' is -F^T A^-1 a less what landmarks take by B A^-1 F.
+        held = -inner.solve_reduced(right_side[:, None])[:, 0]
+        of_border = self.gradient - reduced.gradient - reduced.by_landmark.mT @ held
+        z = -torch.cholesky_solve(of_border[:, None], factor)[:, 0]
+        y = held + reduced.landmarks @ z
+        of_chain = z[self._entries()][inner.structure.owner]
+        linked = inner.eliminated_gradient + (self.link @ of_chain[..., None])[..., 0]
+        x = inner.substitute(y, linked)
+        delta = {**inner.unpack(x, y), **self.layout.unpack(z[None])}
+        parts = inner.step_parts(x, y, added_x, added_y)
         return solved_step(delta, *parts, StepPart(z[None], self.gradient[None], added[None]))
+
+    def _failed(self) -> Step:
+        inner, nothing = self.inner, torch.zeros_like(self.gradient)
+        still = inner.unpack(inner.eliminated_gradient, inner.gradient)
+        return failed_step({**still, **self.layout.unpack(nothing[None])}, self.cost)
 
     def covariance(self, *, floor: float = UNOBSERVED_FLOOR) -> BorderedCovariance:
         """Covariances of the landmarks, of the border and of sums over the chains, all else marginalised."""
@@ -149,6 +150,7 @@ class BorderedNormalEquations:
         plan, owner = self.inner.structure.plan, self.inner.structure.owner
         entry, size = self._entries(), len(self.gradient)
         T, coupled, first = self.hessian + torch.diag(added), [], 0
+        gradient, own_gradient = torch.zeros_like(self.gradient), self.inner.eliminated_gradient
         for name, offset in self.layout.offset.items():
             own = slice(first, first + self.layout.tangent_dim[name])
             x = self.inner.solve_eliminated(self.link[..., own].contiguous())
@@ -156,11 +158,13 @@ class BorderedNormalEquations:
             coupled.append(self.inner.couple(x, block, len(offset)).flatten(1))
             at = entry[:, :, None] * size + entry[:, None, own]
             T.view(-1).index_add_(0, at.flatten(), -self._by_chain(x).flatten())
+            product = (x.mT @ own_gradient[..., None])[..., 0]
+            gradient.index_add_(0, entry[owner][:, own].flatten(), product.flatten())
             first = own.stop
         by_landmark = torch.cat(coupled, dim=1)
         by_landmark = by_landmark - self.beside
         landmarks = self.inner.solve_reduced(by_landmark)
-        return Reduced(T - by_landmark.mT @ landmarks, by_landmark, landmarks)
+        return Reduced(T - by_landmark.mT @ landmarks, by_landmark, landmarks, gradient)
 
     def _entries(self) -> Int[Tensor, "j b"]:
         """Where in the border the blocks of every chain are."""
@@ -184,6 +188,8 @@ class Reduced:
     """B A^-1 F, less the landmarks' part of F."""
     landmarks: Float[Tensor, "r z"]
     """S^-1 of it: the landmarks' part of K^-1 F, with the opposite sign."""
+    gradient: Float[Tensor, " z"]
+    """F^T A^-1 a: what the border is told by the chains alone."""
 
 
 class BorderedCovariance(LandmarkCovariance):

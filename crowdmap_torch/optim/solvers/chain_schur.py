@@ -32,10 +32,7 @@ from crowdmap_torch.optim.solvers.block_elimination import (
     eliminate,
     fill_chain,
     lead_of,
-    leads_of,
-    rows_of,
     scatter,
-    solve_rounds,
 )
 from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
@@ -50,6 +47,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
     failed_step,
     solved_step,
 )
+from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
@@ -121,7 +119,7 @@ class ChainBackend:
                 batch_bytes=self.batch_bytes,
                 before=before,
             )
-            if before is None or self._structure.order is not before.order:
+            if before is None or self._structure.reduced is not before.reduced:
                 block = values[self.plan.chains]
                 k = problem.variables[self.plan.chains].tangent_dim
                 # The old one goes before the new one comes.
@@ -139,7 +137,7 @@ class Workspace:
     system: TileMatrix
     """The reduced system."""
     store: Float[Tensor, "rows k"]
-    """Per eliminated block and column of its window a row of `k`, by when it is eliminated."""
+    """Per eliminated block and column of its window a row of `k`, by when it is eliminated; part after part in the same."""
     couplings: dict[str, Float[Tensor, "f w _"]] = field(default_factory=dict)
     """Of the last normal equations, by term."""
     factor: Factor | None = None
@@ -162,8 +160,8 @@ class Workspace:
 class Factor:
     """The factorised matrix, together with the store."""
 
-    leads: list[Lead]
-    """By round."""
+    leads: tuple[tuple[Lead, ...], ...]
+    """By part and round."""
     reduced: TiledCholesky
     """Of S."""
 
@@ -192,7 +190,7 @@ class ChainNormalEquations:
         if right_side is None:
             return failed_step(self.unpack(self.eliminated_gradient, self.gradient), self.cost)
         y = -self.solve_reduced(right_side[:, None])[:, 0]
-        x = self._substitute(y)
+        x = self.substitute(y, self.eliminated_gradient)
         return solved_step(self.unpack(x, y), *self.step_parts(x, y, added_x, added_y))
 
     def damped_by(
@@ -242,12 +240,16 @@ class ChainNormalEquations:
         found = diagonal_of_inverse(structure, self.diagonal, self.link)
 
         def solve(right_side: Float[Tensor, "e k c"]) -> Float[Tensor, "e k c"]:
-            blocks = structure.by_place(self.diagonal, self.link)
-            return self._solve_with(leads_of(structure.rounds, *blocks), right_side)
+            solved = torch.empty_like(right_side)
+            for part in structure.parts:
+                leads = part.leads(self.diagonal, self.link)
+                solved[part.block] = part.solve(leads, right_side[part.block])
+            return solved
 
         joints = joints_of(structure, self.coupling, self.hessian, solve)
         if joints is not None:
-            found += joints.of_blocks(torch.arange(len(found), device=found.device))
+            for part in structure.parts:
+                found[part.block] += joints.of_blocks(part.block)
         return found
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
@@ -266,15 +268,26 @@ class ChainNormalEquations:
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
         """Variances of the changes between blocks of chains, by the last factors: leaves marginalised, all else known."""
-        of, variance = changes.of, self.gradient.new_empty(len(changes.pair), changes.of.shape[1])
-        for column in range(changes.columns):
+        structure, factor = self.structure, self.workspace.factor
+        assert factor is not None
+        of, leaves = changes.of, structure.plan.leaf_count
+        variance = self.gradient.new_zeros(len(changes.pair), of.shape[1])
+        # A change counts at either end, which need not be in one part.
+        end = torch.arange(2, device=of.device).repeat_interleave(len(changes.pair))
+        row = torch.arange(len(changes.pair), device=of.device).repeat(2)
+        block = changes.pair.T.flatten() + leaves
+        of_part, number = structure.plan.part_of_blocks[block], structure.number[block]
+        for i, (part, leads) in enumerate(zip(structure.parts, factor.leads, strict=True)):
+            mine = of_part == i
             # One at a time: all of them are several times as large as what is solved.
-            here = torch.nonzero(changes.column == column)[:, 0]
-            first, second = changes.pair[here].T
-            right_side = of.new_zeros(len(self.structure.plan.chain), *of.shape)
-            right_side[first], right_side[second] = -of, of
-            found = self.solve_chains(right_side)
-            variance[here] = (of * (found[second] - found[first])).sum(1)
+            for column in torch.unique(changes.column[row[mine]]).tolist():
+                here = torch.nonzero(mine & (changes.column[row] == column))[:, 0]
+                sign = (2.0 * end[here] - 1)[:, None, None]
+                at = number[here] - part.leaf_count
+                right_side = of.new_zeros(len(part.block) - part.leaf_count, *of.shape)
+                right_side[at] = sign * of
+                found = part.solve_chains(leads, right_side)[at]
+                variance.index_add_(0, row[here], (sign * of * found).sum(1))
         joints = joints_of(self.structure, self.coupling, self.hessian, self.solve_eliminated)
         if joints is not None:
             variance += joints.of_changes(changes, self.structure.plan.leaf_count)
@@ -288,23 +301,28 @@ class ChainNormalEquations:
         The arguments are added to the diagonals of A and C. Of S only the upper triangle counts. The eliminated rows are
         in the store.
         """
-        structure, store = self.structure, self.workspace.store
-        store.zero_()
-        for name, block in self.coupling.items():
-            rows, block = structure.factor_rows[name], block.flatten(0, 1)
-            narrow = store[:, : block.shape[1]]
-            if name in structure.alone:
-                narrow.index_copy_(0, rows, block)
-            else:
-                narrow.index_add_(0, rows, block)
-        store[structure.right_side_row] = self.eliminated_gradient
-        system = self.workspace.system
+        structure, system = self.structure, self.workspace.system
         system.copy_from(self.hessian, structure.direct_tiles)
         system.right_side.copy_(self.gradient)
         system.add_diagonal(added_y)
-        diagonal, link = structure.by_place(self.diagonal + torch.diag_embed(added_x), self.link)
-        leads, products = [], Products(system)
-        for of_round in structure.rounds:
+        products = Products(system)
+        leads = tuple(self._eliminate(part, added_x, products) for part in structure.parts)
+        products.subtract()
+        # What is not positive definite on the way gives numbers that are not finite, and the factors none either.
+        reduced = TiledCholesky.of(system)
+        if reduced is None:
+            return None
+        self.workspace.factor = Factor(leads, reduced)
+        return system.right_side
+
+    def _eliminate(
+        self, part: Part, added: Float[Tensor, "e k"], products: Products
+    ) -> tuple[Lead, ...]:
+        """Takes a part's chains off the reduced system, round by round, and hands back what the rounds leave behind."""
+        store = self._filled_store(part)
+        diagonal, link = part.by_place(self.diagonal, self.link, added)
+        leads = []
+        for of_round in part.rounds:
             lead = lead_of(of_round, diagonal, link)
             leads.append(lead)
             fill_chain(of_round, lead.square(), diagonal, link)
@@ -313,20 +331,27 @@ class ChainNormalEquations:
                 here = of_round.of_batch(batch)
                 return eliminate(batch, lead.whiten[here], lead.towards[here], store)
 
-            parts = in_order(eliminated, of_round.batches, store.device)
-            for batch, part in zip(of_round.batches, parts, strict=True):
-                store.index_add_(0, batch.fill.flatten(), part.fill)
-                if part.scattered is not None:
-                    scatter(batch, part.scattered, system)
+            done = in_order(eliminated, of_round.batches, store.device)
+            for batch, found in zip(of_round.batches, done, strict=True):
+                store.index_add_(0, batch.fill.flatten(), found.fill)
+                if found.scattered is not None:
+                    scatter(batch, found.scattered, self.workspace.system)
                 elif batch.products is not None:
-                    products.add(batch.products, part.wide)
-        products.subtract()
-        # What is not positive definite on the way gives numbers that are not finite, and the factors none either.
-        reduced = TiledCholesky.of(system)
-        if reduced is None:
-            return None
-        self.workspace.factor = Factor(leads, reduced)
-        return system.right_side
+                    products.add(batch.products, found.wide)
+        return tuple(leads)
+
+    def _filled_store(self, part: Part) -> Float[Tensor, "rows k"]:
+        """The store with a part's couplings and gradient."""
+        store = self.workspace.store[: part.store_rows + 1].zero_()
+        for name, own in part.factors.items():
+            rows, block = part.factor_rows[name], self.coupling[name][own].flatten(0, 1)
+            narrow = store[:, : block.shape[1]]
+            if name in part.alone:
+                narrow.index_copy_(0, rows, block)
+            else:
+                narrow.index_add_(0, rows, block)
+        store[part.right_side_row] = self.eliminated_gradient[part.block]
+        return store
 
     def solve_reduced(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
         """S^-1 of right-hand sides, by the last factors."""
@@ -338,29 +363,11 @@ class ChainNormalEquations:
 
         Chains do not touch each other in A: one column serves as many right-hand sides as there are chains.
         """
-        assert self.workspace.factor is not None
-        return self._solve_with(self.workspace.factor.leads, right_side)
-
-    def _solve_with(
-        self, leads: list[Lead], right_side: Float[Tensor, "e k c"]
-    ) -> Float[Tensor, "e k c"]:
-        place = self.structure.place
-        rest = right_side.new_zeros(len(self.structure.order), *right_side.shape[1:])
-        rest[place] = right_side
-        return solve_rounds(self.structure.rounds, leads, rest)[place]
-
-    def solve_chains(self, right_side: Float[Tensor, "n k c"]) -> Float[Tensor, "n k c"]:
-        """The same of the chains' blocks alone, the leaves marginalised."""
-        structure = self.structure
-        # Leaves are the first round, if there are any.
-        begun = int(structure.plan.leaf_count > 0)
-        gone = structure.rounds[0].place.stop if begun else 0
-        place = structure.place[structure.plan.leaf_count :] - gone
-        rest = right_side.new_zeros(len(structure.order) - gone, *right_side.shape[1:])
-        rest[place] = right_side
-        assert self.workspace.factor is not None
-        leads = self.workspace.factor.leads[begun:]
-        return solve_rounds(structure.rounds[begun:], leads, rest)[place]
+        factor, solved = self.workspace.factor, torch.empty_like(right_side)
+        assert factor is not None
+        for part, leads in zip(self.structure.parts, factor.leads, strict=True):
+            solved[part.block] = part.solve(leads, right_side[part.block])
+        return solved
 
     def couple(
         self, x: Float[Tensor, "e k c"], column: Int[Tensor, " e"], columns: int
@@ -386,24 +393,11 @@ class ChainNormalEquations:
             total[:, : product.shape[1]].index_add_(0, coupling.block, product)
         return total
 
-    def _substitute(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
-        """The steps of the eliminated blocks, from the last round to the first, out of the store."""
-        structure, factor, store = self.structure, self.workspace.factor, self.workspace.store
-        assert factor is not None
-        # The right-hand side's column counts once, padding not at all.
-        known = torch.cat((y, y.new_tensor([1.0, 0.0])))
-        x = y.new_zeros(len(structure.order), store.shape[1])
-
-        def of_landmarks(batch: Batch) -> Float[Tensor, "e k"]:
-            window = known[batch.columns].repeat_interleave(batch.fill.shape[1], 0)[:, None]
-            return (window @ rows_of(batch, store))[:, 0]
-
-        for of_round, lead in zip(reversed(structure.rounds), reversed(factor.leads), strict=True):
-            own = torch.cat(list(in_order(of_landmarks, of_round.batches, x.device)))
-            beside = x[of_round.neighbour].flatten(1)[..., None]
-            whitened = lead.towards @ beside - lead.whiten @ own[..., None]
-            x[of_round.place] = (lead.whiten.mT @ whitened)[..., 0]
-        return x[structure.place]
+    def substitute(
+        self, y: Float[Tensor, " r"], gradient: Float[Tensor, "e k"]
+    ) -> Float[Tensor, "e k"]:
+        """The steps of the eliminated blocks where landmarks make the step y, by the last factors."""
+        return -self.solve_eliminated((gradient + self.couple_back(y))[..., None])[..., 0]
 
 
 def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> ChainNormalEquations:

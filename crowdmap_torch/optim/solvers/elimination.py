@@ -1,14 +1,12 @@
-"""The order in which chains of blocks are eliminated: odd-even reduction, worked out once per problem.
+"""The order in which chains of blocks are eliminated, worked out once per problem.
 
 Eliminated are the blocks of A in the normal equations, the landmarks' stay:
 
     [ A  B^T ] [ x ]     [ a ]        A: leaves and chains, block tridiagonal but for the leaves
     [ B  C   ] [ y ] = - [ b ]        B: coupling of the landmarks with them, C: landmarks
 
-The chains' blocks are those of one variable (the slow drifts of journeys). Each may carry leaves, blocks of a second
-variable that are bound to it alone (the poses of frames): leaves go first. Then every other block of each chain is
-eliminated, all chains at once; those between are the chain of the next round, half as long, until no block is left (cyclic
-or nested reduction; Golub and Van Loan, Matrix Computations, 4.5.4).
+The chains' blocks are those of one variable (the slow drifts of journeys). `parts` has the order of those that see the same
+roads, part follows part.
 
 Eliminating block j with the diagonal D_j and the links E_j to its neighbours leaves fill-in behind: -E_j^T D_j^-1 E_j among
 the neighbours, and -B_j D_j^-1 E_j in their coupling, in the columns of the landmarks that j is coupled to by then. Where
@@ -17,7 +15,7 @@ that is kept, `windows` says.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,9 +23,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.problem import CostTerm, Problem, Values
+from crowdmap_torch.optim.problem import Problem, Values
+from crowdmap_torch.optim.solvers.couplings import Coupling, coupled_landmarks, couplings_of
 from crowdmap_torch.optim.solvers.dissection import dissected, incidence, near_each_other
 from crowdmap_torch.optim.solvers.layout import Layout, layout
+from crowdmap_torch.optim.solvers.parts import Part, PartBuilder, parts_of_chains
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern
 from crowdmap_torch.optim.solvers.tile_patterns import (
@@ -36,29 +36,7 @@ from crowdmap_torch.optim.solvers.tile_patterns import (
     landmark_pairs,
     reduced_pattern,
 )
-from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, Round, WindowBuilder
-
-
-@dataclass(frozen=True)
-class Coupling:
-    """A term between the eliminated blocks and the landmarks, its rows sorted by (block, landmarks)."""
-
-    order: Int[Tensor, " m"] | None
-    """Rows of the term, in the order of their factors; None where they are in that order already."""
-    factor_of_row: Int[Tensor, " m"] | None
-    """Rows of one eliminated block and the same landmarks add up to one factor; None: every row is its own."""
-    block: Int[Tensor, " f"]
-    """Eliminated block of each factor, counted over leaves and chains."""
-    column: Int[Tensor, "f w"]
-    """Columns of the reduced system that the factor touches."""
-    landmark: Int[Tensor, "f q"]
-    """The same as landmark blocks."""
-    widths: tuple[int, ...]
-    """Columns of each of them."""
-    slot: int
-    """Slot of the eliminated block."""
-    variable: str
-    """Its variable."""
+from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, WindowBuilder
 
 
 @dataclass(frozen=True)
@@ -71,19 +49,10 @@ class ChainStructure:
     where: Layout
     """The reduced system: all variables but those that the plan names."""
     couplings: dict[str, Coupling]
-    factor_rows: dict[str, Int[Tensor, " fw"]]
-    """Row of the store of every column of a coupling's factors."""
-    alone: frozenset[str]
-    """Terms of whose factors none has a row of the store in common with another's, and that come first."""
-    order: Int[Tensor, " places"]
-    """Block at every place of the order of elimination; the number of blocks where a group has fewer, and last."""
-    place: Int[Tensor, " e"]
-    """Place of every block."""
-    right_side_row: Int[Tensor, " e"]
-    """Row of the store of every block's right-hand side."""
-    store_rows: int
-    """Rows of the store; one more takes what is to be forgotten."""
-    rounds: tuple[Round, ...]
+    parts: tuple[Part, ...]
+    """Chains that are eliminated together, part after part."""
+    number: Int[Tensor, " e"]
+    """Every block's number in its part."""
     direct: TilePattern
     """Tiles of C."""
     reduced: TilePattern
@@ -97,24 +66,17 @@ class ChainStructure:
     keys: Int[Tensor, " keys"] = field(repr=False)
     """What the order has room for: keys `block * count + landmark`, sorted."""
     landmarks: LandmarkBlocks = field(repr=False)
-    windows: WindowBuilder = field(repr=False)
+
+    @property
+    def store_rows(self) -> int:
+        """Rows of the store: of the part that needs most."""
+        return max((part.store_rows for part in self.parts), default=0)
 
     def with_couplings(self, couplings: Mapping[str, Coupling]) -> ChainStructure:
         """The same order for other rows, for whose couplings it has room."""
-        placed, rows = _placed(couplings, self.landmarks, self.windows)
-        alone = _alone(rows, self.store_rows)
-        return replace(self, couplings=placed, factor_rows=rows, alone=alone)
-
-    def by_place(
-        self, diagonal: Float[Tensor, "e k k"], link: Float[Tensor, "e k k"]
-    ) -> tuple[Float[Tensor, "p k k"], Float[Tensor, "p k k"]]:
-        """Diagonal blocks and links of A at the places of the order of elimination.
-
-        A place without a block has no links, and a diagonal that does no harm.
-        """
-        none = torch.eye(diagonal.shape[-1], dtype=diagonal.dtype, device=diagonal.device)[None]
-        links = torch.cat((link, torch.zeros_like(none)))
-        return torch.cat((diagonal, none))[self.order], links[self.order]
+        couplings = {name: c.placed(self.landmarks) for name, c in couplings.items()}
+        parts = _with_couplings(self.parts, couplings, self.plan, self.number)
+        return replace(self, couplings=couplings, parts=parts)
 
     def stack(self, tangents: Mapping[str, Tensor]) -> Float[Tensor, "e k ..."]:
         """Tangents of the leaves and of the chains, one behind the other; narrower ones are padded with zeros."""
@@ -175,31 +137,18 @@ def analyse(
     if plan.leaves is not None and problem.variables[plan.leaves].tangent_dim > k:
         raise ValueError(f"{plan.leaves!r}: expected leaves of at most {k} tangents, the chains'")
     size = group_size or min(64, max(4, _beside_each_other(keys, owner, landmarks.count)))
-    builder = WindowBuilder(landmarks, len(owner), size, k, batch_bytes)
-    windows = [
-        builder.windows(node, neighbour, coupled)
-        for node, neighbour, coupled in _rounds(keys, plan, landmarks.count)
-    ]
+    builders, number = _builders(plan, keys, landmarks, size, k, batch_bytes)
     direct = direct_pattern(landmarks, keys, pairs)
-    reduced = reduced_pattern(direct, landmarks, *builder.bound())
-    places = [table.flatten() for _, _, batches in windows for table, *_ in batches]
-    order = torch.cat((*places, owner.new_full((1,), len(owner))))
-    place = torch.full((len(owner) + 1,), len(order) - 1, device=owner.device)
-    place[order] = torch.arange(len(order), device=owner.device)
-    place[-1] = len(order) - 1
-    couplings, factor_rows = _placed(couplings, landmarks, builder)
+    reduced = reduced_pattern(direct, landmarks, *_bound(builders))
+    couplings = {name: c.placed(landmarks) for name, c in couplings.items()}
+    parts = [builder.part(reduced) for builder in builders]
     return ChainStructure(
         plan=plan,
         width={name: problem.variables[name].tangent_dim for name in plan.first_block},
         where=where,
         couplings=couplings,
-        rounds=tuple(builder.round(*of_round, place, reduced) for of_round in windows),
-        factor_rows=factor_rows,
-        alone=_alone(factor_rows, builder.store_rows),
-        order=order,
-        place=place[:-1],
-        right_side_row=builder.first_row[:-1],
-        store_rows=builder.store_rows,
+        parts=_with_couplings(parts, couplings, plan, number),
+        number=number,
         direct=direct,
         reduced=reduced,
         direct_tiles=reduced.numbers_of(direct),
@@ -207,7 +156,70 @@ def analyse(
         border=layout(problem, values, skip=_all_but(problem, plan.border)),
         keys=keys,
         landmarks=landmarks,
-        windows=builder,
+    )
+
+
+def _builders(
+    plan: EliminationPlan,
+    keys: Int[Tensor, " keys"],
+    landmarks: LandmarkBlocks,
+    group_size: int,
+    k: int,
+    batch_bytes: int,
+) -> tuple[list[PartBuilder], Int[Tensor, " e"]]:
+    """The parts' orders of elimination as far as they do not hang on each other, and every block's number in its part."""
+    part = plan.part_of_blocks
+    if not len(part):
+        return [], part
+    count = torch.bincount(part)
+    blocks = torch.argsort(part, stable=True).split(count.tolist())
+    number = torch.empty_like(part)
+    for block in blocks:
+        number[block] = torch.arange(len(block), device=part.device)
+    of_key = part[keys // landmarks.count]
+    by_part = keys[torch.argsort(of_key, stable=True)]
+    each = by_part.split(torch.bincount(of_key, minlength=len(count)).tolist())
+    builders = [
+        PartBuilder(
+            *(plan, block, number, own),
+            WindowBuilder(landmarks, len(block), group_size, k, batch_bytes),
+        )
+        for block, own in zip(blocks, each, strict=True)
+    ]
+    return builders, number
+
+
+def _bound(builders: Sequence[PartBuilder]) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+    """Groups of all parts, and the places of the landmarks in their windows, in the order of columns."""
+    groups, places, first = [], [], 0
+    for builder in builders:
+        group, place = builder.windows.bound()
+        groups.append(group + first)
+        places.append(place)
+        first += builder.windows.groups
+    if not groups:
+        none = torch.zeros(0, dtype=torch.long)
+        return none, none
+    return torch.cat(groups), torch.cat(places)
+
+
+def _with_couplings(
+    parts: Sequence[Part],
+    couplings: Mapping[str, Coupling],
+    plan: EliminationPlan,
+    number: Int[Tensor, " e"],
+) -> tuple[Part, ...]:
+    """The parts with the factors of the couplings, which follow each other part by part."""
+    part, bound = plan.part_of_blocks, torch.arange(len(parts) + 1, device=number.device)
+    ends = {
+        name: torch.searchsorted(part[c.block].contiguous(), bound).tolist()
+        for name, c in couplings.items()
+    }
+    return tuple(
+        one.with_couplings(
+            couplings, {name: slice(end[i], end[i + 1]) for name, end in ends.items()}, number
+        )
+        for i, one in enumerate(parts)
     )
 
 
@@ -217,37 +229,14 @@ def _beside_each_other(keys: Int[Tensor, " keys"], owner: Int[Tensor, " e"], cou
     return round(len(own) / max(len(torch.unique(own)), 1))
 
 
-def _placed(
-    couplings: Mapping[str, Coupling], landmarks: LandmarkBlocks, windows: WindowBuilder
-) -> tuple[dict[str, Coupling], dict[str, Int[Tensor, " fw"]]]:
-    """Couplings with their columns of the reduced system, and the rows of the store that these are."""
-    rows = {name: windows.rows(c.block, c.landmark, c.widths) for name, c in couplings.items()}
-    placed = {
-        name: replace(c, column=landmarks.columns(c.landmark, c.widths))
-        for name, c in couplings.items()
-    }
-    return placed, rows
-
-
-def _alone(rows: Mapping[str, Int[Tensor, " fw"]], size: int) -> frozenset[str]:
-    """The terms that may be copied into a store of this size, as no row of theirs is taken by then."""
-    alone, taken = set(), None
-    for name, of_term in rows.items():
-        if taken is None:
-            taken = torch.zeros(size, dtype=torch.long, device=of_term.device)
-        taken.index_add_(0, of_term, torch.ones_like(of_term))
-        if bool((taken[of_term] == 1).all()):
-            alone.add(name)
-    return frozenset(alone)
-
-
 def planned_ahead(
     problem: Problem, values: Values, plan: EliminationPlan, *, sliding: Collection[str] = ()
 ) -> EliminationPlan:
     """The plan with what the rows show of the landmarks, which serves them still when they have changed a little.
 
-    Landmarks are ranked such that those coupled to one block are near each other (worked out on the CPU), and there is room
-    for rows that go over to the next landmark, by number, of the `sliding` variables.
+    Landmarks are ranked such that those coupled to one block are near each other, chains parted by what they see (both
+    worked out on the CPU), and there is room for rows that go over to the next landmark, by number, of the `sliding`
+    variables.
     """
     _, landmarks, _, keys = _touched(problem, values, plan)
     pairs = landmark_pairs(problem, landmarks, plan.first_block)
@@ -259,7 +248,10 @@ def planned_ahead(
             goes = (at >= 0) & (at < number) & (at + step >= 0) & (at + step < number)
             room.append(keys[goes] + step)
     return replace(
-        plan, rank=_rank(keys, pairs, plan.owner, landmarks), room=torch.unique(torch.cat(room))
+        plan,
+        rank=_rank(keys, pairs, plan.owner, landmarks),
+        room=torch.unique(torch.cat(room)),
+        part=parts_of_chains(keys, plan, count),
     )
 
 
@@ -269,82 +261,12 @@ def _touched(
     """The reduced system, its blocks, and what of it the eliminated blocks are coupled to, by term and as keys."""
     where = layout(problem, values, skip=(*plan.first_block, *plan.border))
     landmarks = LandmarkBlocks.of(where, plan.chain.device)
-    couplings = _couplings(problem.terms, plan, plan.owner, landmarks)
-    return where, landmarks, couplings, _coupled_landmarks(couplings, landmarks)
+    couplings = couplings_of(problem.terms, plan, landmarks)
+    return where, landmarks, couplings, coupled_landmarks(couplings, landmarks)
 
 
 def _all_but(problem: Problem, names: Collection[str]) -> tuple[str, ...]:
     return tuple(name for name in problem.variables if name not in names)
-
-
-def _couplings(
-    terms: Mapping[str, CostTerm], plan: EliminationPlan, owner: Tensor, landmarks: LandmarkBlocks
-) -> dict[str, Coupling]:
-    """The terms between eliminated blocks and landmarks; terms that the plan has no place for are refused."""
-    first_block, couplings = plan.first_block, {}
-    for name, term in terms.items():
-        eliminated = [i for i, (slot, _) in enumerate(term.slots) if slot in first_block]
-        border = [i for i, (slot, _) in enumerate(term.slots) if slot in plan.border]
-        others = len(term.slots) - len(eliminated) - len(border)
-        if len(eliminated) > 2 or (others and len(eliminated) > 1):
-            raise ValueError(
-                f"term {name!r} couples {len(eliminated)} eliminated blocks and {others} others; "
-                "at most two eliminated blocks are supported, and one with landmarks"
-            )
-        for i in eliminated:
-            slot, block = term.slots[i]
-            chain = owner[block + first_block[slot]]
-            for beside, its_block in (term.slots[k] for k in border):
-                if not torch.equal(plan.border[beside][chain], its_block):
-                    raise ValueError(
-                        f"term {name!r} couples blocks of {slot!r} with the {beside!r} of another chain"
-                    )
-        if others and eliminated:
-            at = [i for i in range(len(term.slots)) if i not in border]
-            term = replace(term, slots=tuple(term.slots[i] for i in at))
-            found = _coupling(term, at.index(eliminated[0]), landmarks, first_block)
-            couplings[name] = replace(found, slot=eliminated[0])
-    return couplings
-
-
-def _coupling(
-    term: CostTerm, slot: int, landmarks: LandmarkBlocks, first_block: dict[str, int]
-) -> Coupling:
-    name, block = term.slots[slot]
-    block = block + first_block[name]
-    others = [
-        index + landmarks.first[other] for i, (other, index) in enumerate(term.slots) if i != slot
-    ]
-    # One number for the landmarks of a row: mixed radix, hashed down before it can overflow.
-    key = block
-    for at, index in enumerate(others):
-        if at:
-            _, key = torch.unique(key, return_inverse=True)
-        key = key * landmarks.count + index
-    order = None
-    if not bool((key[1:] >= key[:-1]).all()):
-        order = torch.argsort(key, stable=True)
-        key = key[order]
-    begins = torch.ones_like(key, dtype=torch.bool)
-    begins[1:] = key[1:] != key[:-1]
-    factor_of_row = None if bool(begins.all()) else begins.cumsum(0) - 1
-    first = torch.nonzero(begins)[:, 0]
-    first = first if order is None else order[first]
-    landmark = torch.stack([index[first] for index in others], dim=-1)
-    widths = tuple(
-        landmarks.width_of[other] for i, (other, _) in enumerate(term.slots) if i != slot
-    )
-    column = landmarks.columns(landmark, widths)
-    return Coupling(order, factor_of_row, block[first], column, landmark, widths, slot, name)
-
-
-def _coupled_landmarks(
-    couplings: dict[str, Coupling], landmarks: LandmarkBlocks
-) -> Int[Tensor, " keys"]:
-    """Which block is coupled to which landmark: keys `block * count + landmark`, sorted and unique."""
-    keys = [(c.block[:, None] * landmarks.count + c.landmark).flatten() for c in couplings.values()]
-    none = torch.zeros(0, dtype=torch.long, device=landmarks.column.device)
-    return torch.unique(torch.cat([none, *keys]))
 
 
 def _rank(
@@ -367,42 +289,3 @@ def _rank(
     if not len(width):
         return torch.zeros(count, dtype=torch.double, device=keys.device)
     return torch.from_numpy(dissected(bound, width, position)).double().to(keys.device)
-
-
-def _rounds(
-    keys: Int[Tensor, " keys"], plan: EliminationPlan, count: int
-) -> Iterator[tuple[Int[Tensor, " g"], Int[Tensor, "g s"], Int[Tensor, " keys_g"]]]:
-    """Per round the blocks that go, their neighbours, and the landmarks they are coupled to by then, as keys."""
-    leaves, n = plan.leaf_count, plan.leaf_count + len(plan.chain)
-    index = torch.arange(n, device=plan.chain.device)
-    if plan.carrier is not None and leaves:
-        neighbour = (plan.carrier + leaves)[:, None]
-        yield index[:leaves], neighbour, keys[keys < leaves * count]
-        keys = _filled_in(keys, index[:leaves], neighbour, n, count)
-    node = index[leaves:]
-    while len(node):
-        of = plan.chain[node - leaves]
-        first = torch.ones_like(of, dtype=torch.bool)
-        first[1:] = of[1:] != of[:-1]
-        at = torch.arange(len(node), device=node.device)
-        goes = (at - at[first][first.cumsum(0) - 1]) % 2 == 0
-        last = torch.cat((first[1:], first.new_ones(1)))
-        before = torch.where(first, n, torch.cat((node[:1], node[:-1])))
-        behind = torch.where(last, n, torch.cat((node[1:], node[-1:])))
-        neighbour = torch.stack((before, behind), dim=-1)[goes]
-        gone = torch.zeros(n, dtype=torch.bool, device=node.device)
-        gone[node[goes]] = True
-        yield node[goes], neighbour, keys[gone[keys // count]]
-        keys = _filled_in(keys, node[goes], neighbour, n, count)
-        node = node[~goes]
-
-
-def _filled_in(
-    keys: Int[Tensor, " keys"], node: Tensor, neighbour: Tensor, n: int, count: int
-) -> Int[Tensor, " keys_after"]:
-    """The couplings of the blocks that stay once `node` are gone: their own, and the fill-in from their neighbours."""
-    receiver = torch.arange(n + 1, device=keys.device)[:, None].repeat(1, neighbour.shape[1])
-    receiver[node] = neighbour
-    block, landmark = keys // count, keys % count
-    receivers = receiver[block]
-    return torch.unique((receivers * count + landmark[:, None])[receivers < n])

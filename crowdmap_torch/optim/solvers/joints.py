@@ -109,7 +109,10 @@ def joints_of(
     )
     entry = own[joint].flatten(1)
     of_chain = drive[joint.amax(1)]
-    taken = like.new_zeros(chains, 2 * width, 2 * width).index_add_(0, structure.owner, E.mT @ U)
+    # Few blocks touch a joint.
+    ends = torch.nonzero(E.flatten(1).any(1))[:, 0]
+    taken = like.new_zeros(chains, 2 * width, 2 * width)
+    taken.index_add_(0, structure.owner[ends], E[ends].mT @ U[ends])
     area = (of_chain[:, None, None] * most * width + entry[:, :, None]) * most * width
     M.view(-1).index_add_(0, (area + entry[:, None]).flatten(), -taken.flatten())
     return Joints(U, structure.owner, of_chain, entry, torch.linalg.inv(M))

@@ -39,6 +39,10 @@ class EliminationPlan:
     """What eliminated blocks may be coupled to (`planned_ahead`): the order of elimination is kept while they are coupled to
     nothing else. None: it is found whenever they are coupled to others."""
 
+    part: Int[Tensor, " chains"] | None = None
+    """Which of several parts each chain is of (`planned_ahead`): parts are eliminated one after the other, and those that
+    see other roads have little in common. None: all at once."""
+
     def __post_init__(self) -> None:
         """Refuses chains in pieces, and leaves that hang on nothing."""
         pieces = 1 + int((self.chain[1:] != self.chain[:-1]).sum()) if len(self.chain) else 0
@@ -77,3 +81,19 @@ class EliminationPlan:
         if self.carrier is None:
             return self.chain
         return torch.cat((self.chain[self.carrier], self.chain))
+
+    @property
+    def part_of_blocks(self) -> Int[Tensor, " e"]:
+        """Part that each eliminated block belongs to, counted over leaves and chains."""
+        owner = self.owner
+        return torch.zeros_like(owner) if self.part is None else self.part[owner]
+
+    @property
+    def rank_of_blocks(self) -> Int[Tensor, " e"] | None:
+        """Where each stands when parts follow each other; None: where it stands anyhow."""
+        if self.part is None:
+            return None
+        order = torch.argsort(self.part_of_blocks, stable=True)
+        rank = torch.empty_like(order)
+        rank[order] = torch.arange(len(order), device=order.device)
+        return rank

@@ -16,19 +16,29 @@ from torch import Tensor
 
 from crowdmap_torch.optim.solvers.block_elimination import leads_of
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
+from crowdmap_torch.optim.solvers.parts import Part
 
 
 def diagonal_of_inverse(
     structure: ChainStructure, diagonal: Float[Tensor, "e k k"], link: Float[Tensor, "e k k"]
 ) -> Float[Tensor, "e k k"]:
     """Diagonal blocks of the inverse of A."""
+    found = torch.empty_like(diagonal)
+    for part in structure.parts:
+        found[part.block] = _of_part(part, *part.by_place(diagonal, link))
+    return found
+
+
+def _of_part(
+    part: Part, diagonal: Float[Tensor, "p k k"], link: Float[Tensor, "p k k"]
+) -> Float[Tensor, "n k k"]:
+    """The same of a part's blocks, by their blocks by place, which are changed."""
     k = diagonal.shape[-1]
-    at_place, links = structure.by_place(diagonal, link)
-    leads = leads_of(structure.rounds, at_place, links)
-    found = diagonal.new_zeros(len(structure.order), k, k)
+    leads = leads_of(part.rounds, diagonal, link)
+    found = torch.zeros_like(diagonal)
     # With the block that follows, of those known so far.
     crossed = torch.zeros_like(found)
-    for of_round, lead in zip(reversed(structure.rounds), reversed(leads), strict=True):
+    for of_round, lead in zip(reversed(part.rounds), reversed(leads), strict=True):
         inverse, towards = lead.whiten.mT @ lead.whiten, lead.whiten.mT @ lead.towards
         around = found[of_round.neighbour]
         if of_round.neighbour.shape[1] == 2:
@@ -42,4 +52,4 @@ def diagonal_of_inverse(
         else:
             with_neighbours = towards @ around[:, 0]
         found[of_round.place] = inverse + with_neighbours @ towards.mT
-    return found[structure.place]
+    return found[part.place]

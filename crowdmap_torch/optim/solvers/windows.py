@@ -95,6 +95,8 @@ class LandmarkBlocks:
     """The blocks in the order of their columns."""
     position: Int[Tensor, " q"]
     """Where in that order each is."""
+    of_column: Int[Tensor, " dim"]
+    """The block of every column."""
 
     @classmethod
     def of(cls, where: Layout, device: torch.device) -> LandmarkBlocks:
@@ -106,12 +108,17 @@ class LandmarkBlocks:
             columns.append(offset)
             widths.append(torch.full_like(offset, where.tangent_dim[name]))
         none = torch.zeros(0, dtype=torch.long, device=device)
-        width_of = {name: where.tangent_dim[name] for name in first}
-        column = torch.cat([none, *columns])
+        column, width = torch.cat([none, *columns]), torch.cat([none, *widths])
         ordered = torch.argsort(column)
-        position = torch.argsort(ordered)
         return cls(
-            first, column, torch.cat([none, *widths]), width_of, where.dim, ordered, position
+            first=first,
+            column=column,
+            width=width,
+            width_of={name: where.tangent_dim[name] for name in first},
+            dim=where.dim,
+            ordered=ordered,
+            position=torch.argsort(ordered),
+            of_column=torch.repeat_interleave(ordered, width[ordered]),
         )
 
     def columns(self, landmark: Int[Tensor, "f q"], widths: Sequence[int]) -> Int[Tensor, "f w"]:
@@ -149,8 +156,6 @@ class WindowBuilder:
         self.groups = 0
         self.window_keys: list[Tensor] = []
         self.window_places: list[Tensor] = []
-        ordered = self.landmarks.ordered
-        self.landmark_of = torch.repeat_interleave(ordered, self.landmarks.width[ordered])
         self._keys = self._places = torch.zeros(0, dtype=torch.long, device=device)
 
     def windows(
@@ -284,7 +289,7 @@ class WindowBuilder:
         lm = rest = torch.zeros_like(columns)[:, None, :, None]
         if dim:
             at = torch.where(known, columns, 0)
-            lm = self.landmark_of[at]
+            lm = self.landmarks.of_column[at]
             lm, rest = lm[:, None, :, None], (at - self.landmarks.column[lm])[:, None, :, None]
         place, found = self._place(self.group_of[receiver][:, :, None, :], lm)
         is_gradient = (columns == dim)[:, None, :, None]

@@ -98,11 +98,18 @@ def problem(chain_lengths, landmarks=9, seed=0):
     return Problem(variables, terms), values, chain
 
 
+def in_parts(plan: EliminationPlan, parts: int) -> EliminationPlan:
+    """The plan with its chains in so many parts, in turns."""
+    return replace(plan, part=torch.arange(plan.chain_count) % parts)
+
+
 @pytest.mark.parametrize("lengths", [[1], [9], [10, 1, 9, 8], [85, 40], [19, 2, 33]])
 @pytest.mark.parametrize(("group_size", "batch_bytes"), [(None, 1 << 22), (1, 1), (3, 2000)])
-def test_elimination_gives_the_dense_step(lengths, group_size, batch_bytes):
+@pytest.mark.parametrize("parts", [1, 3])
+def test_elimination_gives_the_dense_step(lengths, group_size, batch_bytes, parts):
     built, values, chain = problem(lengths)
-    backend = ChainBackend(EliminationPlan("pose", chain), group_size, batch_bytes)
+    plan = in_parts(EliminationPlan("pose", chain), parts)
+    backend = ChainBackend(plan, group_size, batch_bytes)
     chained, dense = (b.assemble(built, values) for b in (backend, DenseBackend()))
     torch.testing.assert_close(chained.cost, dense.cost)
     for damping in (1e-6, 1e-1, 1e3):
@@ -115,7 +122,8 @@ def test_elimination_gives_the_dense_step(lengths, group_size, batch_bytes):
 
 
 @pytest.mark.parametrize("lengths", [[1], [10, 1, 9], [85, 40]])
-def test_leaves_and_chain_give_the_dense_step(lengths):
+@pytest.mark.parametrize("parts", [1, 2])
+def test_leaves_and_chain_give_the_dense_step(lengths, parts):
     built, values, chain = problem(lengths)
     n = len(chain)
     every = torch.arange(n)
@@ -131,7 +139,8 @@ def test_leaves_and_chain_give_the_dense_step(lengths):
     variables = {**built.variables, "drift": Variable(3, euclidean)}
     problem_with_leaves = Problem(variables, {**terms, "bound": bound})
     values = {**values, "drift": values["pose"] + 0.1}
-    backend = ChainBackend(EliminationPlan("drift", chain, "pose", every), group_size=7)
+    plan = in_parts(EliminationPlan("drift", chain, "pose", every), parts)
+    backend = ChainBackend(plan, group_size=7)
     damping = torch.tensor([1e-3], dtype=torch.float64)
     ours = backend.assemble(problem_with_leaves, values).solve(damping)
     dense = DenseBackend().assemble(problem_with_leaves, values)
@@ -179,7 +188,7 @@ def test_wide_windows_subtracted_run_by_run_give_the_dense_step(chunk):
     damping = torch.tensor([1e-3], dtype=torch.float64)
     ours = backend.assemble(built, values).solve(damping)
     structure, _ = backend.prepare(built, values)
-    batches = [batch for of_round in structure.rounds for batch in of_round.batches]
+    batches = [b for part in structure.parts for of_round in part.rounds for b in of_round.batches]
     assert {batch.products is None for batch in batches} == {True, False}
     theirs = DenseBackend().assemble(built, values).solve(damping)
     for name in values:
@@ -201,9 +210,10 @@ def test_marginal_covariance_is_the_block_of_the_dense_inverse():
 
 
 @pytest.mark.parametrize("lengths", [[1], [2], [10, 1, 9, 8], [85, 40], [19, 2, 33]])
-def test_block_covariances_are_those_of_the_dense_inverse_with_landmarks_held(lengths):
+@pytest.mark.parametrize("parts", [1, 2])
+def test_block_covariances_are_those_of_the_dense_inverse_with_landmarks_held(lengths, parts):
     built, values, chain = problem(lengths, seed=4)
-    backend = ChainBackend(EliminationPlan("pose", chain), group_size=5)
+    backend = ChainBackend(in_parts(EliminationPlan("pose", chain), parts), group_size=5)
     found = backend.assemble(built, values).conditional_covariance("pose")
     n = len(chain)
     of_chains = DenseBackend().assemble(built, values).hessian[0, : 3 * n, : 3 * n]
@@ -295,7 +305,7 @@ def test_the_order_is_kept_while_rows_go_no_further_than_there_is_room(by: int, 
     later = moved_on(built, by)
     found = backend.assemble(later, values).solve(damping)
     after, _ = backend.prepare(later, values)
-    assert (after.order is before.order) == keeps
+    assert (after.reduced is before.reduced) == keeps
     # Nothing of what came before is left: a run that is resumed ends with the same bits.
     fresh = ChainBackend(plan).assemble(later, values).solve(damping)
     dense = DenseBackend().assemble(later, values).solve(damping)
@@ -335,16 +345,18 @@ def covariance_of(
 
 
 @pytest.mark.parametrize("leaves", [False, True])
-def test_changes_along_chains_vary_as_the_dense_inverse_says(leaves: bool):
+@pytest.mark.parametrize("parts", [1, 2])
+def test_changes_along_chains_vary_as_the_dense_inverse_says(leaves: bool, parts: int):
     built, values, chain = problem([12, 7])
     plan, eliminated = EliminationPlan("pose", chain), ("pose",)
     if leaves:
         built, values = on_drift(built, values, chain)
         every = torch.arange(len(chain))
         plan, eliminated = EliminationPlan("drift", chain, "pose", every), ("drift", "pose")
-    normal = ChainBackend(plan).assemble(built, values)
+    normal = ChainBackend(in_parts(plan, parts)).assemble(built, values)
     normal.solve(torch.tensor([1e-12], dtype=torch.float64))
-    pair, column = torch.tensor([[0, 5], [12, 15], [5, 11]]), torch.tensor([0, 0, 1])
+    # The last is between two chains.
+    pair, column = torch.tensor([[0, 5], [12, 15], [5, 11], [3, 14]]), torch.tensor([0, 0, 1, 2])
     # The numbers of a block, and the first less the last.
     of = torch.cat((torch.eye(3), torch.tensor([[1.0], [0.0], [-1.0]])), dim=1).double()
     found = normal.variance_of_changes(ChainChanges(pair, column, of))
@@ -360,7 +372,7 @@ def test_leaves_vary_about_what_carries_them_as_the_dense_inverse_says():
     built, values, chain = problem([12, 7])
     n = len(chain)
     built, values = on_drift(built, values, chain)
-    plan = EliminationPlan("drift", chain, "pose", torch.arange(n))
+    plan = in_parts(EliminationPlan("drift", chain, "pose", torch.arange(n)), 2)
     found = ChainBackend(plan).assemble(built, values).variance_of_leaves()
     less = torch.cat((torch.eye(3 * n), -torch.eye(3 * n)), dim=1).double()
     P = covariance_of(built, values, "pose", "drift")
