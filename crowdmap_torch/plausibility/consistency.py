@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.special import ndtr, stdtrit
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
@@ -41,26 +40,16 @@ class ConsistencyLimits:
     """Share of the journeys in which it has to be smaller."""
     shifts: tuple[int, ...] = (-3, -2, -1, 1, 2, 3)
     """Frames by which the numbers may be off."""
-    least_journeys: int = 4
-    """Journeys from which a lever arm is concluded: what one shows is mostly the drift of its poses."""
-    least_lever_m: float = 0.6
-    """Shorter levers are not named."""
     size_m: tuple[float, float] = (0.05, 25.0)
     """Median size of the signs: less and more is another unit of positions."""
     usual_m: tuple[float, float] = (0.3, 2.5)
     """The same under the unit that is named."""
     meeting_px: float = 15.0
     """How far rays may miss each other where their meeting alone tells a unit."""
-    sure: float = 3.0
-    """Standard deviations that a lever has to exceed; of few journeys as many as are as rare by Student's distribution."""
-
-
-_REWEIGHTINGS = 8
-"""Rounds of reweighting by Cauchy's loss."""
 
 
 @dataclass(frozen=True)
-class _Views:
+class SignsSeen:
     """Views of the signs of one journey: raw pixels of the outlines' middles."""
 
     px: Float[Tensor, "m 2"]
@@ -79,22 +68,20 @@ def consistency_findings(
     limits = limits or ConsistencyLimits()
     given_px: list[float] = []
     sizes: list[float] = []
-    levers: list[_Lever] = []
     tried: dict[str, list[float]] = {}
     findings: dict[str, Finding] = {}
     for journey, tracks in zip(journeys, tracklets, strict=True):
-        views = _views(journey, tracks, limits)
-        rays = None if views is None else _rays(views, journey.rig.camera)
-        met = None if rays is None else _met(journey, rays, 0, limits)
+        views = sign_views(journey, tracks, limits.least_views)
+        rays = None if views is None else rays_of(views, journey.rig.camera)
+        met = None if rays is None else met_at(journey, rays, 0, limits)
         if views is None or rays is None or met is None:
             continue
         given = met.misfit_px
         sizes.append(float((views.extent_px * met.distance)[met.counted].median()) / rays.focal_px)
         given_px.append(given)
-        levers.append(_lever(journey, rays))
         for name, camera, shift, finding in _instead(journey, limits):
-            other = rays if camera is journey.rig.camera else _rays(views, camera)
-            under = _met(journey, other, shift, limits)
+            other = rays if camera is journey.rig.camera else rays_of(views, camera)
+            under = met_at(journey, other, shift, limits)
             ratio = math.inf if under is None else under.misfit_px / given
             tried.setdefault(name, []).append(ratio)
             findings[name] = finding
@@ -110,7 +97,7 @@ def consistency_findings(
         if ratio < enough and float((found < best).double().mean()) >= limits.agreeing:
             named.append((ratio, name))
     if not named:
-        return _lever_findings(levers, limits)
+        return []
     ratio, name = min(named)
     usual = sorted(given_px)[len(given_px) // 2]
     evidence = (
@@ -119,9 +106,10 @@ def consistency_findings(
     return [replace(findings[name], evidence=f"{evidence} {findings[name].evidence}")]
 
 
-def _views(journey: Journey, tracks: Tracklets, limits: ConsistencyLimits) -> _Views | None:
+def sign_views(journey: Journey, tracks: Tracklets, fewest: int) -> SignsSeen | None:
+    """The views of all signs with so many of them; None if there is no such sign."""
     label = tracks.label
-    often = torch.bincount(label[label >= 0], minlength=tracks.count) >= limits.least_views
+    often = torch.bincount(label[label >= 0], minlength=tracks.count) >= fewest
     used = (
         torch.nonzero((label >= 0) & often[label.clamp_min(0)])[:, 0] if tracks.count else label[:0]
     )
@@ -131,27 +119,28 @@ def _views(journey: Journey, tracks: Tracklets, limits: ConsistencyLimits) -> _V
     corners = journey.signs.corners_px[used]
     middle = (corners.amin(1) + corners.amax(1)) / 2
     extent = (corners.amax(1) - corners.amin(1)).amax(-1)
-    return _Views(middle, extent, journey.signs.frame[used], compact, len(sign))
+    return SignsSeen(middle, extent, journey.signs.frame[used], compact, len(sign))
 
 
 @dataclass(frozen=True)
-class _Rays:
+class Rays:
     """Views as directions in the camera's frame."""
 
-    views: _Views
+    views: SignsSeen
     ray_camera: Float[Tensor, "m 3"]
     closes: Bool[Tensor, " m"]
     focal_px: float
 
 
-def _rays(views: _Views, camera: Camera) -> _Rays:
+def rays_of(views: SignsSeen, camera: Camera) -> Rays:
+    """Their directions by a camera's lens."""
     ideal, closes = unproject(camera, views.px)
     ray = torch.nn.functional.normalize(torch.nn.functional.pad(ideal, (0, 1), value=1.0), dim=-1)
-    return _Rays(views, ray, closes, float(camera.K[0, 0]))
+    return Rays(views, ray, closes, float(camera.K[0, 0]))
 
 
 @dataclass(frozen=True)
-class _Met:
+class Met:
     """Where all rays to a sign together put its middle, beside each of them."""
 
     point_world: Float[Tensor, "m 3"]
@@ -168,8 +157,11 @@ class _Met:
         return float(self.off_px[self.counted].median())
 
 
-def _met(journey: Journey, rays: _Rays, shift: int, limits: ConsistencyLimits) -> _Met | None:
+def met_at(
+    journey: Journey, rays: Rays, shift: int = 0, limits: ConsistencyLimits | None = None
+) -> Met | None:
     """Where rays meet if detections are of frames so many later; None if too few signs are seen so that one could tell."""
+    limits = limits or ConsistencyLimits()
     views = rays.views
     frame = (views.frame + shift).clamp(0, journey.frame_count - 1)
     T_world_camera = journey.T_world_camera[frame]
@@ -185,7 +177,7 @@ def _met(journey: Journey, rays: _Rays, shift: int, limits: ConsistencyLimits) -
     counted = rays.closes & (spread[views.sign] > least) & ((towards * ray).sum(-1) > 0)
     if int(counted.sum()) < limits.least_views:
         return None
-    return _Met(point[views.sign], angle * rays.focal_px, to_point.norm(dim=-1), counted)
+    return Met(point[views.sign], angle * rays.focal_px, to_point.norm(dim=-1), counted)
 
 
 @dataclass(frozen=True)
@@ -207,8 +199,8 @@ def meeting_of(
 ) -> Meeting | None:
     """Where signs are seen, and where they would be from all frames together; None if that tells nothing."""
     limits = limits or ConsistencyLimits()
-    views = _views(journey, tracks, limits)
-    met = None if views is None else _met(journey, _rays(views, journey.rig.camera), 0, limits)
+    views = sign_views(journey, tracks, limits.least_views)
+    met = None if views is None else met_at(journey, rays_of(views, journey.rig.camera), 0, limits)
     if views is None or met is None:
         return None
     T_camera_world = se3.inverse(journey.T_world_camera[views.frame])
@@ -246,8 +238,8 @@ def crawl_findings(journey: Journey, tracks: Tracklets, limits: ConsistencyLimit
 
     A car that stands sees all signs in one direction: under no unit do their rays meet.
     """
-    views = _views(journey, tracks, limits)
-    met = None if views is None else _met(journey, _rays(views, journey.rig.camera), 0, limits)
+    views = sign_views(journey, tracks, limits.least_views)
+    met = None if views is None else met_at(journey, rays_of(views, journey.rig.camera), 0, limits)
     if views is None or met is None or met.misfit_px > limits.meeting_px:
         return []
     focal_px = float(journey.rig.camera.K[0, 0])
@@ -267,77 +259,6 @@ def crawl_findings(journey: Journey, tracks: Tracklets, limits: ConsistencyLimit
 
 
 _PER_KM = 1e3
-
-
-@dataclass(frozen=True)
-class _Lever:
-    """Where, in the camera's frame, a journey's positions are of, if not of the camera."""
-
-    place: Float[Tensor, " 3"]
-    """By the rays' best meeting [m]."""
-    information: Float[Tensor, "3 3"]
-    """What its rays tell of it; what the poses' drift does to it is not in there."""
-
-
-def _lever(journey: Journey, rays: _Rays) -> _Lever:
-    """The lever under which the rays of a journey meet best.
-
-    A lever moves all views of a straight drive alike; only where the car turns does it keep rays apart. Signs are
-    eliminated, what is left are three unknowns.
-    """
-    views = rays.views
-    T = journey.T_world_camera[views.frame]
-    R, given = T[:, :3, :3], T[:, :3, 3]
-    ray = se3.rotate(T, rays.ray_camera)
-    eye = torch.eye(3, dtype=ray.dtype, device=ray.device)
-    across = eye - ray[:, :, None] * ray[:, None]
-    weight, lever, information = rays.closes.to(ray), ray.new_zeros(3), eye
-    for _ in range(_REWEIGHTINGS):
-        origin = given - R @ lever
-        point, _ = midpoint_ragged(origin, ray, views.sign, views.count, weight)
-        off = (across @ (origin - point[views.sign])[..., None])[..., 0]
-        away = (point[views.sign] - origin).norm(dim=-1).clamp_min(1.0)
-        angle = off.norm(dim=-1) / away
-        usual = angle.median().clamp_min(1e-6)
-        weight = rays.closes / away.square() / (1 + (angle / usual).square())
-        by_point = weight[:, None, None] * across
-        # [[A, B], [B^T, C]] over signs and the lever; A is block diagonal.
-        A = ray.new_zeros(views.count, 3, 3).index_add(0, views.sign, by_point) + 1e-9 * eye
-        B = ray.new_zeros(views.count, 3, 3).index_add(0, views.sign, by_point @ R)
-        at = (by_point @ given[..., None])[..., 0]
-        right = ray.new_zeros(views.count, 3).index_add(0, views.sign, at)
-        solved = torch.linalg.solve(A, torch.cat((B, right[..., None]), dim=-1))
-        C = (R.mT @ by_point @ R).sum(0) - (B.mT @ solved[..., :3]).sum(0)
-        rest = (R.mT @ at[..., None])[..., 0].sum(0) - (B.mT @ solved[..., 3:])[..., 0].sum(0)
-        lever = torch.linalg.solve(C + 1e-9 * eye, rest)
-        information = C / usual.square()
-    return _Lever(lever, information)
-
-
-def _lever_findings(levers: Sequence[_Lever], limits: ConsistencyLimits) -> list[Finding]:
-    """Whether the journeys agree that positions are of another place on the car, ahead of the camera or behind it."""
-    count = len(levers)
-    if count < limits.least_journeys:
-        return []
-    information = torch.stack([lever.information for lever in levers])
-    told = (information @ torch.stack([lever.place for lever in levers])[..., None])[..., 0]
-    # Of all journeys, and of all but one in turn: what drift does to each of them shows in how these differ (jackknife).
-    without = torch.linalg.solve(information.sum(0) - information, told.sum(0) - told)[:, 2]
-    usual = float(torch.linalg.solve(information.sum(0), told.sum(0))[2])
-    sigma = float((count - 1) ** 0.5 * without.std(correction=0))
-    as_rare = float(stdtrit(count - 1, ndtr(limits.sure)))
-    if abs(usual) < max(limits.least_lever_m, as_rare * sigma):
-        return []
-    where = "ahead of" if usual > 0 else "behind"
-    return [
-        Finding(
-            "lever-arm",
-            f"rays to one sign meet best if positions are of a place {abs(usual):.1f} m {where} "
-            f"the camera (sigma {sigma:.1f} m)",
-            "positions are of an antenna or an IMU, not of the pose link",
-            "give the rig a mount (rig.urdf) from that place to the camera",
-        )
-    ]
 
 
 def _instead(

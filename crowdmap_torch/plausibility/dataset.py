@@ -19,6 +19,7 @@ from crowdmap_torch.plausibility.consistency import (
 from crowdmap_torch.plausibility.detections import Outlines, detection_findings
 from crowdmap_torch.plausibility.finding import Finding, Repair, gathered
 from crowdmap_torch.plausibility.lens import is_bare, lens_findings
+from crowdmap_torch.plausibility.lever import HIDDEN_LEVER, hidden_lever, lever_findings, lever_of
 from crowdmap_torch.plausibility.poses import axes_alike, in_kilometres, pose_findings
 from crowdmap_torch.plausibility.rig import rig_findings
 from crowdmap_torch.tables import Dataset, Journey, to_device
@@ -33,14 +34,15 @@ def look_over(
     folder: Path, dataset: Dataset, positioning: PositioningNoise, config: SignAssociationConfig
 ) -> tuple[Finding, ...]:
     """What looks wrong with the journeys of the data set in `folder`, each finding once."""
-    return gathered(findings_by_journey(folder, dataset, positioning, config))
+    found = findings_by_journey(folder, dataset, positioning, config)
+    return gathered([row for row in found if row[1].kind != HIDDEN_LEVER])
 
 
 @torch.no_grad()
 def findings_by_journey(
     folder: Path, dataset: Dataset, positioning: PositioningNoise, config: SignAssociationConfig
 ) -> list[tuple[str, Finding]]:
-    """What looks wrong, with the journey in which it was seen.
+    """What looks wrong, with the journey in which it was seen, and which mistake would not show.
 
     Signs are triangulated only where nothing else is wrong: a mistake that shows by itself spoils them too. Of many sound
     journeys some are triangulated, and what is found is said of all of them. What is looked at is on the processor.
@@ -66,11 +68,11 @@ def findings_by_journey(
     # What is wrong with the lens keeps rays from meeting, too.
     of_lens = lens_findings(some, tracklets, positioning)
     if not of_lens:
-        return found + [
-            (journey.journey_id, finding)
-            for finding in consistency_findings(some, tracklets)
-            for journey in sound
-        ]
+        of_rays = consistency_findings(some, tracklets)
+        if not of_rays:
+            lever = lever_of(some, tracklets, positioning)
+            of_rays = lever_findings(lever) or hidden_lever(lever)
+        return found + [(j.journey_id, finding) for finding in of_rays for j in sound]
     named = {name: finding for name, finding in of_lens}
     by_lens = {is_bare(j.rig): named[j.journey_id] for j in some if j.journey_id in named}
     return found + [

@@ -8,6 +8,7 @@ the good set again, or near to them.
 from __future__ import annotations
 
 import argparse
+import itertools
 import shutil
 import tempfile
 from collections import Counter
@@ -48,6 +49,8 @@ class Outcome:
     cured: bool
     told: str
     """What was found, and how far what was put right is from the good set."""
+    hidden: str = ""
+    """What is said where it does not show, and why."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sets", nargs="+", choices=[*GOOD], default=[*GOOD], metavar="NAME")
     parser.add_argument(
         "--only", nargs="+", choices=[*MISTAKES], default=[*MISTAKES], metavar="MISTAKE"
+    )
+    parser.add_argument(
+        "--seeds", nargs="+", type=int, metavar="SEED", help="sets of these seeds, not their own"
     )
     parser.add_argument("--folder", type=Path, help="keep the data sets here")
 
@@ -65,17 +71,19 @@ def run(options: argparse.Namespace) -> int:
     named: Counter[str] = Counter()
     cured: Counter[str] = Counter()
     tried: Counter[str] = Counter()
-    alarms = short = 0
+    alarms = short = good_sets = 0
     with tempfile.TemporaryDirectory(prefix="soak-") as temporary:
         folder = options.folder or Path(temporary)
-        for set_name in options.sets:
-            good = folder / set_name.replace(" ", "-")
+        for set_name, seed in itertools.product(options.sets, options.seeds or [None]):
+            label = set_name if seed is None else f"{set_name} {seed}"
+            good = folder / label.replace(" ", "-")
             if not good.exists():
-                write_good_set(set_name, good)
+                write_good_set(set_name, good, seed)
             sound = check_dataset(good)
             found = grave(sound)
             alarms += bool(found)
-            print(f"{set_name}: {', '.join(sorted(found)) or 'nothing found'}", flush=True)
+            good_sets += 1
+            print(f"{label}: {', '.join(sorted(found)) or 'nothing found'}", flush=True)
             for mistake in () if set_name in _FEW else options.only:
                 if sound.dataset is None or not MISTAKES[mistake].can_be_made(sound.dataset):
                     continue
@@ -87,14 +95,16 @@ def run(options: argparse.Namespace) -> int:
                 if outcome.named and outcome.cured == expected.is_cured:
                     continue
                 is_hidden = expected.may_hide and not outcome.told
+                is_hidden &= bool(outcome.hidden) or not expected.hidden_as
                 short += not is_hidden
-                print(f"  {mistake}: {outcome.told or 'nothing found'}", flush=True)
+                told = outcome.told or "nothing found"
+                print("; ".join(filter(None, (f"  {mistake}: {told}", outcome.hidden))), flush=True)
     print(f"\n{'mistake':<18} {'named':>7} {'put right':>10}")
     for mistake in options.only:
         of = tried[mistake]
         right = f"{cured[mistake]}/{of}" if MISTAKES[mistake].is_cured else "-"
         print(f"{mistake:<18} {f'{named[mistake]}/{of}':>7} {right:>10}")
-    print(f"false alarms: {alarms} of {len(options.sets)} good data sets")
+    print(f"false alarms: {alarms} of {good_sets} good data sets")
     return 1 if alarms or short else 0
 
 
@@ -109,7 +119,9 @@ def attempt(good: Path, drives: Dataset | None, place: Path, mistake: str) -> Ou
     )
     is_named = names(check, mistake)
     if not any(item.repairs for item in check.items):
-        return Outcome(is_named, False, told)
+        note = MISTAKES[mistake].hidden_as
+        hidden = ", ".join(i.evidence for i in check.items if note and i.kind == note)
+        return Outcome(is_named, False, told, hidden)
     mended = write_repaired(bad, place / "new", check)
     left = grave(mended.check) ^ ({MISTAKES[mistake].leaves} - {""})
     away = differences(drives, mended.check.dataset)

@@ -21,6 +21,7 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.formats.composing.utm import convergence, grid_from_geodetic
 from crowdmap_torch.io.formats.geodesy import geodetic_from_local
 from crowdmap_torch.io.rigs import read_rig
+from crowdmap_torch.plausibility.lever import HIDDEN_LEVER
 from crowdmap_torch.tables import Dataset, Origin
 
 
@@ -39,6 +40,8 @@ class Mistake:
     """Kind of the finding that is left once it was put right: of what is lost for good."""
     may_hide: bool = False
     """True: not all drives show it (docs/OWN_DATA.md), and what does not show need not be named."""
+    hidden_as: str = ""
+    """Kind of the note that says so where it does not show."""
     of_models: tuple[str, ...] = MODELS
     """Camera models with which it can be made."""
     of_lens: bool = False
@@ -410,7 +413,12 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "frames-late": Mistake("frame-offset", _frames_off, "frame numbers"),
     "antenna": Mistake(
-        "lever-arm", _poses(lambda R, p: (R, p + R @ _ANTENNA)), "an antenna", False, may_hide=True
+        "lever-arm",
+        _poses(lambda R, p: (R, p + R @ _ANTENNA)),
+        "an antenna",
+        is_cured=False,
+        may_hide=True,
+        hidden_as=HIDDEN_LEVER,
     ),
     "normal-up": Mistake(
         "road-normal", _road("normal", lambda n: [-float(x) for x in n]), "upwards"

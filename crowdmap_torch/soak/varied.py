@@ -66,9 +66,10 @@ GOOD: dict[str, SimulationConfig] = {
 """By name; of some `write_good_set` changes the files."""
 
 
-def write_good_set(name: str, folder: Path) -> None:
-    """Writes one of `GOOD`."""
-    write_dataset(GOOD[name], folder)
+def write_good_set(name: str, folder: Path, seed: int | None = None) -> None:
+    """Writes one of `GOOD`, or another world and other drives like it, by a seed."""
+    config = GOOD[name] if seed is None else replace(GOOD[name], seed=seed)
+    write_dataset(config, folder)
     if name in _AFTERWARDS:
         _AFTERWARDS[name](folder)
 
