@@ -102,7 +102,8 @@ def build(
     place, unknowns = given[frame][nodes.first][:, :2, 3], 8 * len(signs) + lane.numel()
     cut = cut_drives(place, nodes.journey, unknowns, config.cut_unknowns)
     poses = pose_prior(
-        *(journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior, cut)
+        *(journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior, cut),
+        error=at_nodes[:, :3],
     )
     at_start = poses.with_wander(at_nodes)
     values = {

@@ -2,7 +2,7 @@
 
 Of a drive that is long beside the way on which the bias forgets where it was, one constant is no longer what its poses have
 in common. Its drift is then drawn to the constant bias and to what this process adds to it, which stands behind the
-pose's error in every node's state. Shorter drives have a process next to zero.
+pose's error in every node's state. Shorter drives have it where they show that they need it, else one next to zero.
 """
 
 from __future__ import annotations
@@ -16,13 +16,20 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_range
 
 LEAST_SHARE = 0.5
-"""Drives that are shorter than this share of the way on which their bias forgets where it was have one bias."""
+"""Drives that are as long as this share of the way on which their bias forgets where it was have one that wanders."""
 WANDER_SHARE = 0.5
 """Most of the variance that is stated for a bias that is taken for one that wanders."""
 _LAG = 1 / 3
 """Over this share of that way changes are compared with their sigma."""
 _START = 1 / 6
 """Over this share of it an estimate that is known is averaged where the process begins."""
+_SOME_SHARE = 0.2
+"""Drives that are shorter than this share of it have one bias whatever they show."""
+_SHORT = 1 / 20
+"""Over this share of it a drift has nearly forgotten where it was, and a bias is where it was."""
+_SHOWN = 1.0
+"""By how many standard deviations of their mean squares must be larger to show it: a false alarm costs a little time, one
+that is missed makes covariances too small."""
 _AT_REST_M = 1e-4
 """1-sigma of the process in drives that have one bias."""
 
@@ -32,9 +39,9 @@ class BiasWander:
     """The prior of the process, in the drives of a bundle of which one at least is long enough for it."""
 
     sigma: Float[Tensor, "j 3"]
-    """By journey, east, north and up [m]; next to none where one is too short for it."""
+    """By journey, east, north and up [m]; next to none where one needs none."""
     is_long: Bool[Tensor, " j"]
-    """Whether it is not."""
+    """Whether it needs one: it is long, or shows it."""
     length_m: float
     far: Int[Tensor, "q 2"]
     """Nodes of long drives whose changes tell of the sigma, each the end of at most one such pair."""
@@ -48,12 +55,37 @@ class BiasWander:
         return -2 * torch.expm1(-gap / self.length_m) * self.sigma[journey[first]].square()
 
 
-def long_drives(
-    way: Float[Tensor, " n"], journey: Int[Tensor, " n"], journeys: int, length_m: float
+def wandering_drives(
+    way: Float[Tensor, " n"],
+    journey: Int[Tensor, " n"],
+    length_m: float,
+    error: Float[Tensor, "n 3"] | None,
+    drift_sigma: Float[Tensor, "j 3"],
+    drift_length_m: Float[Tensor, "j 3"],
 ) -> Bool[Tensor, " j"]:
-    """True for the journeys whose bias wanders within what was driven."""
-    low, high = group_range(way, journey, journeys)
-    return high - low >= LEAST_SHARE * length_m
+    """True for the journeys whose bias wanders within what was driven.
+
+    That is taken for granted of long drives. Of others of some length it is, if the first estimate of the positions'
+    `error` at nodes changes more from end to end than a drift would that changes over short ways as it does.
+    """
+    low, high = group_range(way, journey, len(drift_sigma))
+    is_long = high - low >= LEAST_SHARE * length_m
+    some = (high - low >= _SOME_SHARE * length_m) & ~is_long
+    if error is None or not bool(some.any()):
+        return is_long
+
+    def changes(pair: Int[Tensor, "q 2"]) -> Float[Tensor, "q 3"]:
+        """Squares of changes, in units of those that a drift makes."""
+        first, second = pair[some[journey[pair[:, 0]]]].T
+        own, gap = journey[first], (way[second] - way[first])[:, None]
+        expected = -2 * torch.expm1(-gap / drift_length_m[own]) * drift_sigma[own].square()
+        return (error[second] - error[first]).square() / expected
+
+    over_all = changes(_ends(journey, len(low)))
+    over_short = changes(nodes_apart(journey, way, _SHORT * length_m))
+    usual = over_short.mean().clamp_min(1) if len(over_short) else 1.0
+    chance = 1 + _SHOWN * (2 / over_all.numel()) ** 0.5
+    return is_long | (some & (over_all.mean() > chance * usual))
 
 
 def bias_wander(
@@ -65,6 +97,10 @@ def bias_wander(
 ) -> BiasWander:
     """The prior of journeys of which those that are long wander by `sigma`, by journey and way of their nodes."""
     far = nodes_apart(journey, way, _LAG * length_m)
+    within = torch.bincount(journey[far[:, 0]], minlength=len(is_long)) == 0
+    ends = _ends(journey, len(is_long))
+    # Of drives that are shorter than that, from end to end.
+    far = torch.cat((far, ends[within[journey[ends[:, 0]]]]))
     far = far[is_long[journey[far[:, 0]]]]
     return BiasWander(torch.where(is_long[:, None], sigma, _AT_REST_M), is_long, length_m, far)
 
@@ -81,6 +117,15 @@ def nodes_apart(
     at = torch.nonzero(begins)[:, 0]
     same = journey[at[1:]] == journey[at[:-1]]
     return torch.stack((at[:-1], at[1:]), dim=1)[same]
+
+
+def _ends(journey: Int[Tensor, " n"], journeys: int) -> Int[Tensor, "q 2"]:
+    """The first and the last node of every journey that has nodes."""
+    every = torch.arange(journeys, device=journey.device)
+    journey = journey.contiguous()
+    first = torch.searchsorted(journey, every)
+    last = torch.searchsorted(journey, every, right=True) - 1
+    return torch.stack((first, last), dim=1)[last >= first]
 
 
 def first_wander(

@@ -22,8 +22,8 @@ from crowdmap_torch.noise.bias_wander import (
     BiasWander,
     bias_wander,
     first_wander,
-    long_drives,
     nodes_apart,
+    wandering_drives,
 )
 from crowdmap_torch.noise.pooled_scales import pooled
 from crowdmap_torch.noise.positioning import PositioningNoise
@@ -343,10 +343,12 @@ def pose_prior(
     positioning: PositioningNoise,
     config: PosePriorConfig,
     cut: Int[Tensor, " s"] | None = None,
+    error: Float[Tensor, "n 3"] | None = None,
 ) -> PosePrior:
     """The prior of the poses `pose` of a bundle, whose drift stands still within `spacing` metres.
 
-    Drives are cut before the nodes `cut`, each of which another one of its journey is before.
+    Drives are cut before the nodes `cut`, each of which another one of its journey is before. By a first estimate of the
+    positions' `error` at nodes biases show whether they wander.
     """
     bias, drift = (
         torch.stack(part)
@@ -378,29 +380,17 @@ def pose_prior(
     }
     length = length.expand(len(journeys), 6)
     wander, reach = None, positioning.wander_length_m
-    is_long = long_drives(nodes.way, nodes.journey, len(journeys), reach)
+    is_long = wandering_drives(
+        *(nodes.way, nodes.journey, reach, error, drift[:, :3], length[:, :3])
+    )
     if positioning.wander_sigma_m and bool(is_long.any()):
         sigma = (WANDER_SHARE**0.5 * bias[:, :3]).clamp_max(positioning.wander_sigma_m)
         left = (bias[:, :3].square() - sigma.square()).sqrt()
         wander = bias_wander(sigma, is_long, nodes.journey, nodes.way, reach)
         bias = torch.cat((torch.where(is_long[:, None], left, bias[:, :3]), bias[:, 3:]), dim=1)
+    chains = (begins, follows, cut, far)
     return PosePrior(
-        *(
-            pose,
-            nodes,
-            spacing,
-            bias,
-            drift,
-            length,
-            white,
-            begins,
-            follows,
-            cut,
-            far,
-            config,
-            slots,
-        ),
-        wander=wander,
+        *(pose, nodes, spacing, bias, drift, length, white, *chains, config, slots), wander=wander
     )
 
 

@@ -35,8 +35,8 @@ class PositioningNoise(Settings):
     """What positioning gets wrong where it does not say itself; every sigma is 1-sigma per axis.
 
     The error of a journey's poses is a bias, a drift about it (an Ornstein-Uhlenbeck process along the way), and noise from
-    frame to frame. Over kilometres the bias wanders: of drives that are long enough it is a constant and a second such
-    process, far slower.
+    frame to frame. Over kilometres the bias wanders: of drives that are long enough, or show it, it is a constant and a
+    second such process, far slower.
     """
 
     bias_sigma_m: tuple[Sigma, Sigma, Sigma] = (0.6, 0.6, 0.9)
@@ -48,7 +48,7 @@ class PositioningNoise(Settings):
     """How far the bias of the position wanders on long drives [m]; each journey's own scale is estimated from there. 0: it
     does not."""
     wander_length_m: Length = 3000.0
-    """Way over which its correlation falls to 1/e; drives of less than half of that have one bias [m]."""
+    """Way over which its correlation falls to 1/e [m]. Drives of half of that wander; from a fifth on where they show it."""
     drift_sigma_m: Sigma = 0.25
     """Slow error of the position [m]; with it the paper's method ends near the paper's relative error (docs/RESULTS.md)."""
     drift_length_m: Length = 150.0
