@@ -34,6 +34,8 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 
 UNHELD_FLOOR = 1e-6
 """Information added to every unknown before its covariance is read: none is less sure than 1000 units."""
+_LANDMARKS_AT_ONCE = 32
+"""Landmarks whose products are taken off the path at once."""
 COLUMNS_AT_ONCE = 256
 """Right-hand sides of a banded system that are solved together; bounds the memory."""
 
@@ -254,11 +256,14 @@ class BandNormalEquations:
         at = ((node * d + j) * band + below).expand_as(self.path)
         lower[at[is_lower]] = self.path[is_lower]
         lower.view(nodes * d, band)[:, 0] += path_added
-        schur = self.coupling.mT @ inverse @ self.coupling
         row, column = torch.tril_indices(width, width, device=lower.device)
         start = self.where.first[:, None] * d
-        at = (start + column) * band + row - column
-        lower.index_add_(0, at.flatten(), -schur[:, row, column].flatten())
+        for some in torch.arange(len(inverse), device=lower.device).split(_LANDMARKS_AT_ONCE):
+            # All at once would not stay in a processor's cache.
+            coupling = self.coupling[some]
+            schur = coupling.mT @ inverse[some] @ coupling
+            at = (start[some] + column) * band + row - column
+            lower.index_add_(0, at.flatten(), -schur[:, row, column].flatten())
         of_path = cholesky_banded(lower.view(nodes * d, band))
         if of_path is None:
             return None

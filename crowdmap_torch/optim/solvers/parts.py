@@ -198,6 +198,9 @@ def parts_of_chains(
             parts, size = parts + 1, 0
         part[taken] = parts
         size += blocks[taken].sum()
+    if parts and size < _LEAST_BLOCKS:
+        part[part == parts] = parts - 1
+        parts -= 1
     if not parts:
         return None
     return torch.from_numpy(part).to(keys.device)
