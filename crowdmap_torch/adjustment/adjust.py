@@ -118,7 +118,7 @@ def build(
     unknown = calibration or CalibrationConfig.off()
     of_frame = nodes.journey[nodes.of_frame]
     fleet = fleet_of(journeys, frame, of_frame, unknown, known_cars or {})
-    values |= {name: fleet.expected[name] for name in fleet.variables}
+    values |= fleet.start
     fixed = _fixed_terms(values, signs, lanes, observed.corners, control, config)
     priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet)
     return Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)

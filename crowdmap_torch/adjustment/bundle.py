@@ -119,7 +119,7 @@ class Bundle(nn.Module):
         self.fleet = priors.fleet
         own = {
             name: Variable(values[name].shape[1], euclidean, pull=pull_euclidean)
-            for name in self.fleet.variables
+            for name in self.fleet.start
         }
         self.variables = VARIABLES | own
         wide = values["drift"].shape[1]
@@ -177,10 +177,9 @@ class Bundle(nn.Module):
         at_cuts = prior.terms(self.prior_scale, self.white_scale)
         seen |= {name: at_cuts[name] for name in CUT_TERMS if name in at_cuts}
         of_journey = prior.journey_of_chain
-        of_cars = {name: self.fleet.of_journey[of_journey] for name in self.fleet.variables}
         plan = EliminationPlan(
             *("drift", prior.chain, "pose", prior.nodes.of_frame),
-            border={"bias": of_journey, **of_cars},
+            border={"bias": of_journey, **self.fleet.blocks(of_journey)},
             joints="cut",
             joint=prior.joint,
         )

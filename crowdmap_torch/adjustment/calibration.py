@@ -5,11 +5,13 @@ the positioning module's word is compared with; the others move what the image s
 
     pose       += [R_world_camera place + clock v; turn + clock omega]
     pixel      += focal (u - c) + principal + read_out (row / height - 1/2) du/dt + box (u - u_sign) + corner
-    lane point += du/dleft lane        height of the road under the camera += height
+    lane point += du/dleft lane        height of the road under the camera += height + load
 
 with the derivatives taken where the unknowns are by now, as with lenses (`lenses`): residuals are those of the true camera.
 What is left out is how the calibration changes the derivatives by poses and landmarks: some thousandths of them. Unknowns
-are in units of their prior sigmas. A car is a `vehicle_id`, or else a rig.
+are in units of their prior sigmas. A car is a `vehicle_id`, or else a rig. A load presses a car down for one drive: what
+was seen from it tells the drive's height to millimetres, and the car's own, which its drives have about, no better than
+loads differ.
 
 Cars that run the same programs err alike: of the prior's variance of clocks, read-outs and detectors they have a share
 in common, x_c = m + d_c with m ~ N(0, share) and d_c ~ N(0, 1 - share). With m marginalised, that of V cars is one row
@@ -70,7 +72,9 @@ class CalibrationConfig(Settings):
     lane_m: LengthOrNone = 0.03
     """How far to the left of a marker's middle, as the driver sees it, its points are detected."""
     height_m: LengthOrNone = 0.03
-    """Height of the camera above the road against the stated one."""
+    """Height of the camera above the road against the stated one, in the mean of the car's loads."""
+    load_m: LengthOrNone = 0.012
+    """What load, fuel and tyres add to that for a drive; 0: nothing."""
     in_common: Share = 0.3
     """Share of the variances of clocks, read-outs and detectors' habits that all cars have in common."""
 
@@ -78,7 +82,7 @@ class CalibrationConfig(Settings):
     def off(cls) -> CalibrationConfig:
         """Everything is known."""
         every = (one.name for kind in VARIABLES.values() for one in kind)
-        return cls(**dict.fromkeys(every, 0.0))
+        return cls(**dict.fromkeys((*every, "load_m"), 0.0))
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,8 @@ OPTICS = (
 """What moves the image, and the road under it."""
 VARIABLES = {"mount": MOUNT, "optics": OPTICS}
 """The unknowns of every car, by variable of the bundle."""
+_LOAD = "load"
+"""The variable of the bundle that has a number for each drive: how much higher than its car's usual the camera is."""
 
 
 def columns(variable: str, config: CalibrationConfig) -> dict[str, slice]:
@@ -175,11 +181,22 @@ class Fleet:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """Those of which anything is unknown."""
+        """Those of the cars of which anything is unknown."""
         return tuple(self.expected)
 
+    @property
+    def start(self) -> dict[str, Float[Tensor, "_ k"]]:
+        """Where all unknowns start, by variable: the cars', and a number for each drive, its load."""
+        if not self.config.load_m:
+            return self.expected
+        return {**self.expected, _LOAD: self.velocity.new_zeros(len(self.of_journey), 1)}
+
+    def blocks(self, journey: Int[Tensor, " n"]) -> dict[str, Int[Tensor, " n"]]:
+        """By variable of `start` the block that drives have."""
+        return {name: journey if name == _LOAD else self.of_journey[journey] for name in self.start}
+
     def priors(self) -> dict[str, CostTerm]:
-        """Calibrations are about as stated, or as found before, and about as those of the other cars."""
+        """Calibrations are about as stated, or as found before, and about as those of the other cars; loads are about 0."""
         every = torch.arange(len(self.vehicles), device=self.velocity.device)
         count = len(self.vehicles)
         first, second = torch.triu_indices(count, count, 1, device=every.device)
@@ -202,6 +219,16 @@ class Fleet:
                     weight=apart * (together[first] & together[second]),
                     takes_rows=True,
                 )
+        if _LOAD in self.start:
+            load = self.start[_LOAD]
+            drives = torch.arange(len(load), device=load.device)
+            terms[f"{_LOAD}_prior"] = CostTerm(
+                gauss_markov_start,
+                ((_LOAD, drives),),
+                (load,),
+                torch.ones_like(load),
+                takes_rows=True,
+            )
         return terms
 
     def of_poses(self, term: CostTerm, by: Float[Tensor, "p 6 k"]) -> CostTerm:
@@ -224,15 +251,16 @@ class Fleet:
         by: ByOptics,
     ) -> dict[str, CostTerm]:
         """`lane_reprojection` by the true camera, and `lane_height` at its true height over the road."""
-        if "optics" not in self.variables:
-            return terms
-        car = self.of_pose[rows.frame]
-        across = (normal_px[:, :, None] * by.image).sum(1, keepdim=True)
         image, ground = terms["lane_reprojection"], terms["lane_height"]
-        return {
-            "lane_reprojection": with_linear_part(image, "optics", car, across),
-            "lane_height": with_linear_part(ground, "optics", car, by.height),
-        }
+        if "optics" in self.variables:
+            car = self.of_pose[rows.frame]
+            across = (normal_px[:, :, None] * by.image).sum(1, keepdim=True)
+            image = with_linear_part(image, "optics", car, across)
+            ground = with_linear_part(ground, "optics", car, by.height)
+        if self.config.load_m:
+            higher = rows.camera_height.new_full((len(rows), 1, 1), -self.config.load_m)
+            ground = with_linear_part(ground, _LOAD, rows.journey, higher)
+        return {"lane_reprojection": image, "lane_height": ground}
 
     def by_mount(self, pose: Float[Tensor, "p 4 4"]) -> Float[Tensor, "p 6 k"]:
         """Derivatives of what the poses given are wrong by, as tangents of geometry.se3, where the poses are `pose`.

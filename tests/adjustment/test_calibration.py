@@ -110,10 +110,34 @@ def test_rows_are_seen_when_they_are_read_out(tiny: Dataset, tiny_result: MapRes
     torch.testing.assert_close(change, later - px, rtol=0.02, atol=2e-3)
 
 
+def heights_over_road(bundle: Bundle) -> Tensor:
+    term = bundle.problem().terms["lane_height"]
+    return residuals(replace(term, weight=None), bundle.values())[:, 0]
+
+
+@pytest.mark.parametrize("cars", [CalibrationConfig(), CalibrationConfig.off()])
+def test_a_load_is_that_of_one_drive(
+    tiny: Dataset, tiny_result: MapResult, cars: CalibrationConfig
+) -> None:
+    load_m = 0.02
+    config = replace(MapperConfig(), calibration=replace(cars, load_m=load_m))
+    bundle = bundle_of(tiny, tiny_result, config)
+    bundle.refresh()
+    before, values = heights_over_road(bundle), bundle.values()
+    assert values["load"].shape == (len(tiny.journeys), 1)
+    drive = int(bundle.lane_points.journey[0])
+    values["load"][drive] = 0.5
+    bundle.fold(values)
+    sunk = torch.where(bundle.lane_points.journey == drive, -0.5 * load_m, 0.0)
+    assert bool((sunk == 0).any())
+    torch.testing.assert_close(heights_over_road(bundle) - before, sunk.to(F64))
+
+
 def test_all_known_is_the_adjustment_without(tiny: Dataset, tiny_result: MapResult) -> None:
     off = replace(MapperConfig(), calibration=CalibrationConfig.off())
     bundle = bundle_of(tiny, tiny_result, off)
-    assert bundle.fleet.variables == () and not {"mount", "optics"} & set(bundle.values())
+    assert bundle.fleet.variables == ()
+    assert not {"mount", "optics", "load"} & set(bundle.values())
     assert not any("prior" in name for name in bundle.problem().terms if "mount" in name)
 
 
@@ -219,6 +243,13 @@ def test_what_is_wrong_with_cars_is_found(wrong: Path, found: FleetCalibration) 
         for a, b in zip(car.estimate["mount_deg"], truth[name]["mount_rotation_deg"], strict=True)
     ]
     assert sum(missed) < 0.5 * sum(far)
+
+
+def test_a_cars_height_is_as_unsure_as_its_loads(found: FleetCalibration) -> None:
+    three_drives = CalibrationConfig().load_m / 3**0.5
+    for car in found.values():
+        (sigma,) = car.sigma["height_m"]
+        assert three_drives < sigma < 2 * three_drives
 
 
 def test_what_cannot_be_seen_is_named(found: FleetCalibration) -> None:
