@@ -13,7 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.adjustment.bundle import Bundle
-from crowdmap_torch.adjustment.found_calibration import FleetCalibration, found_calibration
+from crowdmap_torch.adjustment.found_calibration import (
+    FleetCalibration,
+    found_calibration,
+    sigma_of_mean,
+)
 from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.optim.problem import Values
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, MapCovariance
@@ -42,6 +46,8 @@ class MapUncertainty:
     bias_covariance: Float[Tensor, "j 4 4"]
     calibration: FleetCalibration
     """What cars have wrong for good; empty where that is not asked."""
+    calibration_mean_sigma: dict[str, tuple[float, ...]]
+    """1-sigma of its mean over all cars, by parameter."""
 
 
 @torch.no_grad()
@@ -72,6 +78,7 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
         bias=bias.masked_fill(silent[:, None], torch.nan),
         bias_covariance=of_bias.masked_fill(silent[:, None, None], torch.nan),
         calibration=found_calibration(bundle, covariance),
+        calibration_mean_sigma=sigma_of_mean(bundle, covariance),
     )
 
 

@@ -79,6 +79,20 @@ def found_calibration(bundle: Bundle, covariance: MapCovariance) -> FleetCalibra
     return found
 
 
+def sigma_of_mean(bundle: Bundle, covariance: MapCovariance) -> dict[str, tuple[float, ...]]:
+    """1-sigma of the mean over all cars of a bundle, by parameter, in the units of `CalibrationConfig`.
+
+    Cars err together in what they are told by together, signs and lanes, and in what nothing tells: were all of them wrong
+    by as much, some of it would go into the map.
+    """
+    found = {}
+    for variable in bundle.fleet.variables:
+        of_mean = covariance.of_border_mean(variable).diagonal().clamp_min(0).sqrt()
+        for name, at in calibration.columns(variable, bundle.fleet.config).items():
+            found[name] = tuple((of_mean[at] * getattr(bundle.fleet.config, name)).tolist())
+    return found
+
+
 def _confounded(
     covariance: Float[Tensor, "k k"], labels: list[str]
 ) -> tuple[tuple[str, str, float], ...]:

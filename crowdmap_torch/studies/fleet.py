@@ -15,6 +15,7 @@ from crowdmap_torch.studies.curves import plot_bars
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.maps import OURS, in_short_turns, in_turns, our_maps
 from crowdmap_torch.studies.numbers import Result, numbers, results, spread_of, weighted_mean
+from crowdmap_torch.studies.recovered import recovered_table
 from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureMap, Task
@@ -130,6 +131,11 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
                 _COLUMNS,
                 _rows(whole),
                 f"{scale.journeys} drives of {VEHICLES} vehicles over {scale.road.length_m:.0f} m",
+            ),
+            recovered_table(
+                "fleet-recovered",
+                whole.get((FLEET, "on"), ()),
+                f"What is found of the calibrations of these {VEHICLES} vehicles, all errors together, beside their truth",
             ),
         ),
         plots={"fleet": plot_bars(_bars(every), x="mean relative corner error [m]")},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -31,6 +31,7 @@ from crowdmap_torch.io.truth import JourneyTruth, Truth, read_truth
 from crowdmap_torch.mapper import JourneyMap, build_bundle, clusters_map, finish_map, first_map
 from crowdmap_torch.noise.pose_prior import variance_of_mean
 from crowdmap_torch.simulate.positioning import PositioningConfig
+from crowdmap_torch.studies.recovered import recovered
 from crowdmap_torch.tables import Association, Dataset, HdMap, Survey, concatenate
 
 
@@ -43,6 +44,8 @@ class Drives:
     truth: Truth
     bad: dict[str, str]
     """The faults of bad drives, by journey."""
+    vehicles: Mapping[str, Any]
+    """What cars truly have wrong (FORMAT.md), by vehicle."""
 
     def select(self, rows: Sequence[int]) -> Drives:
         """Some of the journeys."""
@@ -60,7 +63,8 @@ def load_drives(folder: Path) -> Drives:
     survey = read_survey(folder / "survey")
     truth = read_truth(folder / "survey", survey, dataset.journeys)
     bad = read_json(folder / "survey" / "truth" / "bad_drives.json").content
-    return Drives(dataset, survey, truth, bad)
+    vehicles = read_json(folder / "survey" / "truth" / "vehicles.json").content
+    return Drives(dataset, survey, truth, bad, vehicles)
 
 
 def measure_journey(drives: Drives, row: int, made: JourneyMap) -> dict[str, Any]:
@@ -119,6 +123,7 @@ def measure_map(
     measured["map"] = map_figures(drives, final, result.associations, names)
     measured["control_points"] = result.control_points
     measured["shared_covariance"] = final.shared_covariance.tolist()
+    measured["calibration"] = recovered(result.uncertainty, drives.vehicles)
     return measured
 
 

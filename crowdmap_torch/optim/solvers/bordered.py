@@ -219,6 +219,13 @@ class BorderedCovariance(LandmarkCovariance):
         entry = torch.cat([layout.entries(name, slice(None)) for name in names], dim=1)
         return self._border[entry[:, :, None], entry[:, None]]
 
+    def of_border_mean(self, name: str) -> Float[Tensor, "k k"]:
+        """Covariance of the mean over all blocks of a variable of the border."""
+        entry = self._equations.layout.entries(name, slice(None))
+        mean = self._border.new_zeros(len(self._border), entry.shape[1])
+        mean[entry, torch.arange(entry.shape[1], device=entry.device)] = 1 / max(len(entry), 1)
+        return mean.mT @ self._border @ mean
+
     def of_sums(
         self, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
     ) -> Float[Tensor, "j m m"]:

@@ -136,6 +136,10 @@ class MapCovariance(Covariance, Protocol):
         """Covariance of every block of what drives have to themselves or share, of several such variables jointly."""
         ...
 
+    def of_border_mean(self, name: str) -> Float[Tensor, "k k"]:
+        """Covariance of the mean over all blocks of such a variable."""
+        ...
+
     def of_sums(
         self, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
     ) -> Float[Tensor, "j m m"]:

@@ -63,6 +63,8 @@ def test_covariances_are_blocks_of_the_dense_inverse(world):
         at = rows_of(dense, name).view(len(values[name]), -1)
         expected = inverse[at[:, :, None], at[:, None]]
         torch.testing.assert_close(found.of_border(name), expected, rtol=1e-8, atol=1e-12)
+        every = inverse[at[:, None, :, None], at[None, :, None, :]].mean((0, 1))
+        torch.testing.assert_close(found.of_border_mean(name), every, rtol=1e-8, atol=1e-12)
 
 
 def test_a_covariance_whose_factors_are_gone_is_refused():
