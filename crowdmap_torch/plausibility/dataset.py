@@ -65,13 +65,14 @@ def findings_by_journey(
     seen = [j for j in sound if len(j.signs)]
     some = seen[:: -(-len(seen) // _MOST_TRIANGULATED)] if seen else []
     tracklets = [associate_signs(journey, positioning, config) for journey in some]
-    # What is wrong with the lens keeps rays from meeting, too.
-    of_lens = lens_findings(some, tracklets, positioning)
+    # What is wrong with the lens keeps rays from meeting, too: as a lever does, and less so than that if it is none.
+    lever = lever_of(some, tracklets, positioning)
+    of_lever = lever_findings(lever)
+    rival = lever.significance if lever is not None and of_lever else 0.0
+    of_lens = lens_findings(some, tracklets, positioning, rival=rival)
     if not of_lens:
         of_rays = consistency_findings(some, tracklets)
-        if not of_rays:
-            lever = lever_of(some, tracklets, positioning)
-            of_rays = lever_findings(lever) or hidden_lever(lever)
+        of_rays = of_rays or of_lever or hidden_lever(lever)
         return found + [(j.journey_id, finding) for finding in of_rays for j in sound]
     named = {name: finding for name, finding in of_lens}
     by_lens = {is_bare(j.rig): named[j.journey_id] for j in some if j.journey_id in named}

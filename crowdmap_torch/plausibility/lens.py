@@ -116,8 +116,13 @@ def lens_findings(
     tracklets: Sequence[Tracklets],
     positioning: PositioningNoise,
     limits: LensLimits | None = None,
+    *,
+    rival: float = 0.0,
 ) -> list[tuple[str, Finding]]:
-    """Lenses of rigs that the pixels do not have, and lenses of pixels that the rigs do not have, with the journeys."""
+    """Lenses of rigs that the pixels do not have, and lenses of pixels that the rigs do not have, with the journeys.
+
+    What explains the same misfit by so many standard deviations is a `rival`: a lens is named by more of them alone.
+    """
     limits = limits or LensLimits()
     bent: dict[str, MissingLens] = {}
     bare: dict[str, MissingLens] = {}
@@ -129,7 +134,10 @@ def lens_findings(
         found = missing_lens(journey, tracks, other, positioning, limits)
         if found is not None:
             (bare if has_none else bent)[journey.journey_id] = found
-    named = (_undistorted(bent.values(), limits), _without_lens(bare.values(), limits))
+    named = (
+        _undistorted(bent.values(), limits, rival),
+        _without_lens(bare.values(), limits, rival),
+    )
     return [
         (journey, finding)
         for finding, own in zip(named, (bent, bare), strict=True)
@@ -143,12 +151,16 @@ def is_bare(rig: Rig) -> bool:
     return rig.camera.model == "brown_conrady" and not bool((rig.camera.distortion != 0).any())
 
 
-def _undistorted(found: Collection[MissingLens], limits: LensLimits) -> Finding | None:
+def _undistorted(
+    found: Collection[MissingLens], limits: LensLimits, rival: float
+) -> Finding | None:
     if not found:
         return None
     all_of_it = _together(found, limits)
     share, sigma = all_of_it.share, all_of_it.sigma
     if all_of_it.log_ratio < limits.log_ratio or share > limits.most + 2 * sigma:
+        return None
+    if share < rival * sigma:
         return None
     return Finding(
         "undistorted",
@@ -160,12 +172,14 @@ def _undistorted(found: Collection[MissingLens], limits: LensLimits) -> Finding 
     )
 
 
-def _without_lens(found: Collection[MissingLens], limits: LensLimits) -> Finding | None:
+def _without_lens(
+    found: Collection[MissingLens], limits: LensLimits, rival: float
+) -> Finding | None:
     if not found:
         return None
     all_of_it = _together(found, limits)
     k1, sigma = _UNIT_K1 * all_of_it.share, abs(_UNIT_K1) * all_of_it.sigma
-    if abs(k1) < max(limits.least_k1, limits.sure * sigma):
+    if abs(k1) < max(limits.least_k1, max(limits.sure, rival) * sigma):
         return None
     return Finding(
         "no-lens",

@@ -56,6 +56,11 @@ class Lever:
     sigma_m: float
     """With the drift of the poses, and by how journeys differ where they do so more than drift explains."""
 
+    @property
+    def significance(self) -> float:
+        """How many standard deviations it is."""
+        return abs(self.ahead_m) / self.sigma_m
+
     def shortest_m(self, limits: LeverLimits) -> float:
         """Levers that are shorter would not be named, for all that the drives tell [m]."""
         return max(limits.least_m, limits.sure * self.sigma_m)

@@ -13,7 +13,14 @@ from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.plausibility.finding import Finding
-from crowdmap_torch.plausibility.lens import LensLimits, MissingLens, lens_findings, missing_lens
+from crowdmap_torch.plausibility.lens import (
+    LensLimits,
+    MissingLens,
+    _undistorted,
+    _without_lens,
+    lens_findings,
+    missing_lens,
+)
 from crowdmap_torch.soak.spoiled import relensed, spoiled
 from crowdmap_torch.tables import Journey, Tracklets
 from crowdmap_torch.tracking.signs import associate_signs
@@ -115,3 +122,13 @@ def test_drives_that_contradict_each_other_do_not_decide(
         "crowdmap_torch.plausibility.lens.missing_lens", lambda *_: MissingLens(next(said), 0.05)
     )
     assert lens_findings(journeys, nothing, CONFIG.positioning) == []
+
+
+def test_a_lens_is_named_unless_a_lever_explains_more() -> None:
+    # As drives of a block show it by night: a lever of 1.1 m, 18 standard deviations, looks like two thirds of a lens.
+    limits = LensLimits()
+    by_lever, by_lens = [MissingLens(0.66, 0.07)] * 4, [MissingLens(1.0, 0.06)] * 4
+    for judge in (_undistorted, _without_lens):
+        assert judge(by_lever, limits, 0.0) is not None
+        assert judge(by_lever, limits, 40.0) is None
+        assert judge(by_lens, limits, 6.5) is not None
