@@ -23,7 +23,6 @@ from kornia.geometry.camera.distortion_kannala_brandt import (
     undistort_points_kannala_brandt,
 )
 from torch import Tensor
-from torch.func import vjp
 
 MODELS = ("brown_conrady", "kannala_brandt")
 COEFFICIENT_COUNTS = {"brown_conrady": (0, 4, 5, 8, 12, 14), "kannala_brandt": (4,)}
@@ -171,13 +170,13 @@ def projective_bend(camera: Camera, ideal: Float[Tensor, "*batch 2"]) -> Float[T
     if camera.is_linear:
         return torch.zeros_like(ideal)
 
-    def log_det(x: Tensor) -> Tensor:
+    tracked = torch.is_grad_enabled() and ideal.requires_grad
+    with torch.enable_grad():
+        x = ideal if tracked else _leaf(ideal)
         W = _distort_with_jacobian(camera, x)[1]
         det = W[..., 0, 0] * W[..., 1, 1] - W[..., 0, 1] * W[..., 1, 0]
-        return det.abs().log()
-
-    value, pull_back, *_ = vjp(log_det, ideal)
-    g = -pull_back(torch.ones_like(value))[0] / 3
+        total = det.abs().log().sum()
+        g = -torch.autograd.grad(total, x, create_graph=tracked)[0] / 3
     # The nearest ray of the plane 1 + g . d = 0, whose normal in the camera frame is (g, 1 - g .
     # ideal).
     normal = torch.cat((g, 1 - (g * ideal).sum(-1, keepdim=True)), dim=-1)
@@ -216,12 +215,23 @@ def _grid(camera: Camera, length: int, step_px: float) -> Tensor:
 def _distort_with_jacobian(camera: Camera, ideal: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels and their derivatives; one backward pass for each of the two pixel coordinates."""
     # Reverse mode: forward mode of the same function runs its formulas in Python, ten times as slow
-    # for a thousand points.
-    px, pull_back, *_ = vjp(lambda x: distort(camera, x), ideal)
-    along_u = torch.zeros_like(px)
-    along_u[..., 0] = 1
-    rows = (pull_back(seed)[0] for seed in (along_u, along_u.flip(-1)))
-    return px, torch.stack(tuple(rows), dim=-2)
+    # for a thousand points. Not by torch.func, which imports torch's compiler: 0.8 s and 70 MB in every process.
+    tracked = torch.is_grad_enabled() and ideal.requires_grad
+    with torch.enable_grad():
+        x = ideal if tracked else _leaf(ideal)
+        px = distort(camera, x)
+        rows = [
+            torch.autograd.grad(px[..., axis].sum(), x, retain_graph=True, create_graph=tracked)[0]
+            for axis in range(2)
+        ]
+    return px if tracked else px.detach(), torch.stack(rows, dim=-2)
+
+
+def _leaf(x: Tensor) -> Tensor:
+    """A copy to take derivatives by; made by a factory, as `requires_grad_` is refused within torch.func's transforms."""
+    leaf = torch.zeros_like(x, requires_grad=True)
+    leaf.data.copy_(x.detach())
+    return leaf
 
 
 def _unproject_chunk(camera: Camera, px: Tensor) -> tuple[Tensor, Tensor]:
