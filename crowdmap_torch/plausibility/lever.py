@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,6 +32,8 @@ class LeverLimits:
 
     views: tuple[int, int] = (4, 16)
     """Fewest views of a sign that counts, and the most of them that are looked at."""
+    at_once: int = 1024
+    """Views of a drive whose errors are one covariance, at most; longer drives are looked at stretch by stretch."""
     furthest_m: float = 120.0
     """Signs beyond that say nothing."""
     slipped: float = 5.0
@@ -168,7 +170,11 @@ def _said(
     views = sign_views(journey, tracks, limits.views[0])
     rays = None if views is None else rays_of(views, journey.rig.camera)
     seen = None if rays is None else _seen(journey, rays, limits)
-    return None if seen is None else _of(seen, positioning)
+    if seen is None:
+        return None
+    pieces = [_of(piece, positioning) for piece in _pieces(seen, limits)]
+    told, gain, variance = (sum(of_each) for of_each in zip(*map(astuple, pieces), strict=True))
+    return _Said(told, gain, variance)
 
 
 def _seen(journey: Journey, rays: Rays, limits: LeverLimits) -> _Seen | None:
@@ -189,6 +195,39 @@ def _seen(journey: Journey, rays: Rays, limits: LeverLimits) -> _Seen | None:
     ray = se3.rotate(T, rays.ray_camera[rows])
     columns = (T, ray, heading[frame], met.point_world[rows], along[frame], frame, sign)
     return _Seen(*columns, int(sign.max()) + 1, rays.focal_px)
+
+
+def _pieces(seen: _Seen, limits: LeverLimits) -> list[_Seen]:
+    """Stretches of a long drive, whose drift has forgotten that of the one before; each has signs of its own."""
+    count = len(seen.frame)
+    if count <= limits.at_once:
+        return [seen]
+    # Signs in the order in which they come into sight.
+    first = seen.frame.new_full((seen.count,), count)
+    first.scatter_reduce_(0, seen.sign, torch.arange(count, device=first.device), "amin")
+    order = first.argsort()
+    before = torch.bincount(seen.sign, minlength=seen.count)[order].cumsum(0) - 1
+    each = math.ceil(count / math.ceil(2 * count / limits.at_once))
+    piece = torch.empty_like(order)
+    piece[order] = before // each
+    pieces = []
+    for number in piece.unique():
+        rows = torch.nonzero(piece[seen.sign] == number)[:, 0]
+        own, sign = seen.sign[rows].unique(return_inverse=True)
+        pieces.append(
+            _Seen(
+                T_world_camera=seen.T_world_camera[rows],
+                ray_world=seen.ray_world[rows],
+                heading=seen.heading[rows],
+                point_world=seen.point_world[rows],
+                station=seen.station[rows],
+                frame=seen.frame[rows],
+                sign=sign,
+                count=len(own),
+                focal_px=seen.focal_px,
+            )
+        )
+    return pieces
 
 
 def _thinned(

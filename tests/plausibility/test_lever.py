@@ -112,6 +112,17 @@ def test_drives_that_contradict_each_other_show_no_lever_arm() -> None:
     assert "1.2 m behind" in finding.evidence
 
 
+def test_a_long_drive_says_stretch_by_stretch_what_it_says_as_a_whole() -> None:
+    arm = torch.tensor([0.2, -0.5, -1.5]).double()
+    drives = [spoiled(winding_drive(seed, lever=arm), seed) for seed in range(5)]
+    journeys, tracks = [j for j, _ in drives], [t for _, t in drives]
+    whole = lever_of(journeys, tracks, NOISE)
+    cut = lever_of(journeys, tracks, NOISE, replace(LIMITS, at_once=40))
+    assert whole is not None and cut is not None
+    assert abs(cut.ahead_m - whole.ahead_m) < whole.sigma_m
+    assert cut.sigma_m == pytest.approx(whole.sigma_m, rel=0.3)
+
+
 def test_few_drives_do_not_show_a_lever_arm() -> None:
     arm = torch.tensor([0.0, 0.0, -1.5]).double()
     few = LIMITS.least_journeys - 1
