@@ -12,6 +12,7 @@ never visible, pixels that only such a ray could explain never close.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,6 +24,8 @@ from kornia.geometry.camera.distortion_kannala_brandt import (
     undistort_points_kannala_brandt,
 )
 from torch import Tensor
+from torch.autograd import forward_ad
+from torch.func import debug_unwrap, vjp
 
 MODELS = ("brown_conrady", "kannala_brandt")
 COEFFICIENT_COUNTS = {"brown_conrady": (0, 4, 5, 8, 12, 14), "kannala_brandt": (4,)}
@@ -170,13 +173,13 @@ def projective_bend(camera: Camera, ideal: Float[Tensor, "*batch 2"]) -> Float[T
     if camera.is_linear:
         return torch.zeros_like(ideal)
 
-    tracked = torch.is_grad_enabled() and ideal.requires_grad
-    with torch.enable_grad():
-        x = ideal if tracked else _leaf(ideal)
+    def log_det(x: Tensor) -> Tensor:
         W = _distort_with_jacobian(camera, x)[1]
         det = W[..., 0, 0] * W[..., 1, 1] - W[..., 0, 1] * W[..., 1, 0]
-        total = det.abs().log().sum()
-        g = -torch.autograd.grad(total, x, create_graph=tracked)[0] / 3
+        return det.abs().log()
+
+    value, pull_back = _vjp(camera, log_det, ideal)
+    g = -pull_back(torch.ones_like(value))[0] / 3
     # The nearest ray of the plane 1 + g . d = 0, whose normal in the camera frame is (g, 1 - g .
     # ideal).
     normal = torch.cat((g, 1 - (g * ideal).sum(-1, keepdim=True)), dim=-1)
@@ -215,23 +218,47 @@ def _grid(camera: Camera, length: int, step_px: float) -> Tensor:
 def _distort_with_jacobian(camera: Camera, ideal: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels and their derivatives; one backward pass for each of the two pixel coordinates."""
     # Reverse mode: forward mode of the same function runs its formulas in Python, ten times as slow
-    # for a thousand points. Not by torch.func, which imports torch's compiler: 0.8 s and 70 MB in every process.
-    tracked = torch.is_grad_enabled() and ideal.requires_grad
+    # for a thousand points.
+    px, pull_back = _vjp(camera, lambda x: distort(camera, x), ideal)
+    along_u = torch.zeros_like(px)
+    along_u[..., 0] = 1
+    rows = (pull_back(seed)[0] for seed in (along_u, along_u.flip(-1)))
+    return px, torch.stack(tuple(rows), dim=-2)
+
+
+def _vjp(
+    camera: Camera, function: Callable[[Tensor], Tensor], x: Tensor
+) -> tuple[Tensor, Callable[[Tensor], tuple[Tensor, ...]]]:
+    """What `torch.func.vjp` gives of a function by a camera.
+
+    That imports torch's compiler, 0.8 s and 80 MB in every process. It is left alone where plain autograd does: where no
+    transform (`torch.func`, forward mode) is asked for derivatives, and none are by the camera.
+    """
+    given = (camera.K, camera.distortion)
+    if any(tensor.requires_grad for tensor in given) or any(map(_is_transformed, (x, *given))):
+        value, pull_back, *_ = vjp(function, x)
+        return value, pull_back
+    tracked = torch.is_grad_enabled() and x.requires_grad
+    if tracked:
+        at = x
+    else:
+        # Made by a factory: `requires_grad_` is refused while a transform is at work.
+        at = torch.zeros_like(x, requires_grad=True)
+        at.data.copy_(x.detach())
     with torch.enable_grad():
-        x = ideal if tracked else _leaf(ideal)
-        px = distort(camera, x)
-        rows = [
-            torch.autograd.grad(px[..., axis].sum(), x, retain_graph=True, create_graph=tracked)[0]
-            for axis in range(2)
-        ]
-    return px if tracked else px.detach(), torch.stack(rows, dim=-2)
+        value = function(at)
+
+    def pull(seed: Tensor) -> tuple[Tensor, ...]:
+        # Of a sum: handed the seeds themselves, autograd imports sympy.
+        with torch.enable_grad():
+            total = (value * seed).sum()
+        return torch.autograd.grad(total, at, retain_graph=True, create_graph=tracked)
+
+    return value if tracked else value.detach(), pull
 
 
-def _leaf(x: Tensor) -> Tensor:
-    """A copy to take derivatives by; made by a factory, as `requires_grad_` is refused within torch.func's transforms."""
-    leaf = torch.zeros_like(x, requires_grad=True)
-    leaf.data.copy_(x.detach())
-    return leaf
+def _is_transformed(x: Tensor) -> bool:
+    return debug_unwrap(x) is not x or forward_ad.unpack_dual(x).tangent is not None
 
 
 def _unproject_chunk(camera: Camera, px: Tensor) -> tuple[Tensor, Tensor]:

@@ -36,15 +36,15 @@ _AT_REST_M = 1e-4
 
 @dataclass(frozen=True)
 class BiasWander:
-    """The prior of the process, in the drives of a bundle of which one at least is long enough for it."""
+    """The prior of the process, in the drives of a bundle of which one at least needs it."""
 
     sigma: Float[Tensor, "j 3"]
     """By journey, east, north and up [m]; next to none where one needs none."""
-    is_long: Bool[Tensor, " j"]
+    wanders: Bool[Tensor, " j"]
     """Whether it needs one: it is long, or shows it."""
     length_m: float
     far: Int[Tensor, "q 2"]
-    """Nodes of long drives whose changes tell of the sigma, each the end of at most one such pair."""
+    """Nodes of drives that wander whose changes tell of the sigma, each the end of at most one such pair."""
 
     def expected_changes(
         self, pair: Int[Tensor, "q 2"], way: Float[Tensor, " n"], journey: Int[Tensor, " n"]
@@ -90,19 +90,19 @@ def wandering_drives(
 
 def bias_wander(
     sigma: Float[Tensor, "j 3"],
-    is_long: Bool[Tensor, " j"],
+    wanders: Bool[Tensor, " j"],
     journey: Int[Tensor, " n"],
     way: Float[Tensor, " n"],
     length_m: float,
 ) -> BiasWander:
-    """The prior of journeys of which those that are long wander by `sigma`, by journey and way of their nodes."""
+    """The prior of journeys of which those that `wanders` names wander by `sigma`, by journey and way of their nodes."""
     far = nodes_apart(journey, way, _LAG * length_m)
-    within = torch.bincount(journey[far[:, 0]], minlength=len(is_long)) == 0
-    ends = _ends(journey, len(is_long))
+    within = torch.bincount(journey[far[:, 0]], minlength=len(wanders)) == 0
+    ends = _ends(journey, len(wanders))
     # Of drives that are shorter than that, from end to end.
     far = torch.cat((far, ends[within[journey[ends[:, 0]]]]))
-    far = far[is_long[journey[far[:, 0]]]]
-    return BiasWander(torch.where(is_long[:, None], sigma, _AT_REST_M), is_long, length_m, far)
+    far = far[wanders[journey[far[:, 0]]]]
+    return BiasWander(torch.where(wanders[:, None], sigma, _AT_REST_M), wanders, length_m, far)
 
 
 def nodes_apart(
@@ -135,7 +135,7 @@ def first_wander(
     wander: BiasWander,
 ) -> Float[Tensor, "n 3"]:
     """Where the process may begin: the positions' `error` averaged over stretches of some hundred metres, less its mean."""
-    is_long, length_m = wander.is_long, wander.length_m
+    wanders, length_m = wander.wanders, wander.length_m
     cell = (way / (_START * length_m)).floor().long()
     _, of_node = torch.unique_consecutive(torch.stack((journey, cell)), dim=1, return_inverse=True)
     count = torch.bincount(of_node)[:, None]
@@ -151,6 +151,6 @@ def first_wander(
     after = torch.where(owner[after] == journey, after, before)
     share = ((place - at[before]) / (at[after] - at[before]).clamp_min(1e-9)).clamp(0, 1)[:, None]
     smooth = torch.lerp(mean[before], mean[after], share)
-    total = smooth.new_zeros(len(is_long), 3).index_add_(0, journey, smooth)
-    total = total / torch.bincount(journey, minlength=len(is_long)).clamp_min(1)[:, None]
-    return (smooth - total[journey]) * is_long[journey, None]
+    total = smooth.new_zeros(len(wanders), 3).index_add_(0, journey, smooth)
+    total = total / torch.bincount(journey, minlength=len(wanders)).clamp_min(1)[:, None]
+    return (smooth - total[journey]) * wanders[journey, None]

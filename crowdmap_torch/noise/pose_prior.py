@@ -380,14 +380,14 @@ def pose_prior(
     }
     length = length.expand(len(journeys), 6)
     wander, reach = None, positioning.wander_length_m
-    is_long = wandering_drives(
+    wanders = wandering_drives(
         *(nodes.way, nodes.journey, reach, error, drift[:, :3], length[:, :3])
     )
-    if positioning.wander_sigma_m and bool(is_long.any()):
+    if positioning.wander_sigma_m and bool(wanders.any()):
         sigma = (WANDER_SHARE**0.5 * bias[:, :3]).clamp_max(positioning.wander_sigma_m)
         left = (bias[:, :3].square() - sigma.square()).sqrt()
-        wander = bias_wander(sigma, is_long, nodes.journey, nodes.way, reach)
-        bias = torch.cat((torch.where(is_long[:, None], left, bias[:, :3]), bias[:, 3:]), dim=1)
+        wander = bias_wander(sigma, wanders, nodes.journey, nodes.way, reach)
+        bias = torch.cat((torch.where(wanders[:, None], left, bias[:, :3]), bias[:, 3:]), dim=1)
     chains = (begins, follows, cut, far)
     return PosePrior(
         *(pose, nodes, spacing, bias, drift, length, white, *chains, config, slots), wander=wander

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
+from dataclasses import replace
 
 import cv2
 import pytest
@@ -203,6 +206,43 @@ def test_projection_has_finite_derivatives_on_axis_and_behind(name, jacobian):
     for p in ([0.0, 0.0, 3.0], [0.0, 0.0, -3.0], [1.0, 2.0, 0.0]):
         at = torch.tensor(p, dtype=torch.float64)
         assert jacobian(lambda x: camera.project(lens, x)[0])(at).isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["5", "14 tilted", "fisheye"])
+@pytest.mark.parametrize("derived", [camera.pixel_jacobian, camera.projective_bend])
+def test_what_is_derived_of_a_lens_has_derivatives_itself(name, derived):
+    lens = make_camera(name)
+    at = torch.tensor([0.1, -0.2], dtype=torch.float64)
+
+    def by_lens(distortion: torch.Tensor) -> torch.Tensor:
+        return derived(replace(lens, distortion=distortion), at)
+
+    for function, x in ((lambda x: derived(lens, x), at), (by_lens, lens.distortion)):
+        forward, back = jacfwd(function)(x), jacrev(function)(x)
+        leaf = x.clone().requires_grad_()
+        total = torch.autograd.grad(function(leaf).sum(), leaf)[0]
+        step = 1e-6 * torch.eye(len(x), dtype=x.dtype)
+        differences = torch.stack([(function(x + h) - function(x - h)) / 2e-6 for h in step], -1)
+        # They are there, and by all ways the same.
+        assert forward.abs().max() > 1e-3
+        torch.testing.assert_close(forward, back)
+        torch.testing.assert_close(total, back.flatten(0, -2).sum(0))
+        torch.testing.assert_close(forward, differences, rtol=1e-4, atol=1e-6)
+
+
+def test_lenses_leave_torchs_compiler_alone():
+    program = (
+        "import sys, torch; from crowdmap_torch.geometry import camera; "
+        "K = torch.tensor([[800.0, 0, 640], [0, 800, 360], [0, 0, 1]]).double(); "
+        "lens = camera.Camera('brown_conrady', 1280, 720, K, torch.tensor([-0.3, 0.1, 0, 0]).double()); "
+        "px = torch.tensor([[100.0, 200.0]]).double(); "
+        "camera.observation_matrix(lens, px, camera.unproject(lens, px)[0]); "
+        "print([name for name in ('torch._dynamo', 'sympy') if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
 
 
 def apply(M: torch.Tensor, p: torch.Tensor) -> torch.Tensor:

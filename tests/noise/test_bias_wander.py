@@ -32,7 +32,7 @@ def chain(way: Tensor, sigma: float, length: float, generator: torch.Generator) 
 def test_only_drives_that_are_long_beside_its_length_have_a_bias_that_wanders():
     assert make_prior(2, way_m=1400.0, spacing_m=50.0).wander is None
     prior = make_prior(2, way_m=1600.0, spacing_m=50.0)
-    assert wander_of(prior).is_long.all() and (prior.numbers, prior.scale_count) == (9, 4)
+    assert wander_of(prior).wanders.all() and (prior.numbers, prior.scale_count) == (9, 4)
     # What is stated is that of bias, wander and drift together.
     total = prior.bias_sigma[:, :3].square() + wander_of(prior).sigma.square()
     before = make_prior(2, way_m=1400.0, spacing_m=50.0)
@@ -130,6 +130,6 @@ def test_where_it_begins_it_follows_the_error_over_kilometres_and_not_the_drift(
     assert (found - (slow - mean)).square().mean().sqrt() < 0.05
     # One journey alone, or one that is too short, begins at none.
     short = make_prior(2, way_m=1600.0, spacing_m=50.0)
-    none = BiasWander(**{**vars(wander_of(short)), "is_long": torch.tensor([True, False])})
+    none = BiasWander(**{**vars(wander_of(short)), "wanders": torch.tensor([True, False])})
     begun = first_wander(slow[:64], short.nodes.way, short.nodes.journey, none)
     assert not begun[short.nodes.journey == 1].any()

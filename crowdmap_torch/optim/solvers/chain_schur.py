@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -158,7 +159,7 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Factor:
-    """The factorised matrix, together with the store."""
+    """The factorised matrix."""
 
     leads: tuple[tuple[Lead, ...], ...]
     """By part and round."""
@@ -237,16 +238,13 @@ class ChainNormalEquations:
     def _diagonal_of_inverse(self) -> Float[Tensor, "e k k"]:
         """Covariance of every eliminated block, the landmarks known but for the joints of chains."""
         structure = self.structure
-        found = diagonal_of_inverse(structure, self.diagonal, self.link)
-
-        def solve(right_side: Float[Tensor, "e k c"]) -> Float[Tensor, "e k c"]:
-            solved = torch.empty_like(right_side)
-            for part in structure.parts:
-                leads = part.leads(self.diagonal, self.link)
-                solved[part.block] = part.solve(leads, right_side[part.block])
-            return solved
-
-        joints = joints_of(structure, self.coupling, self.hessian, solve)
+        leads = tuple(part.leads(self.diagonal, self.link) for part in structure.parts)
+        found = torch.empty_like(self.diagonal)
+        for part, own in zip(structure.parts, leads, strict=True):
+            found[part.block] = diagonal_of_inverse(part, own)
+        joints = joints_of(
+            *(structure, self.coupling, self.hessian), partial(structure.solve, leads)
+        )
         if joints is not None:
             for part in structure.parts:
                 found[part.block] += joints.of_blocks(part.block)
@@ -288,9 +286,9 @@ class ChainNormalEquations:
                 right_side[at] = sign * of
                 found = part.solve_chains(leads, right_side)[at]
                 variance.index_add_(0, row[here], (sign * of * found).sum(1))
-        joints = joints_of(self.structure, self.coupling, self.hessian, self.solve_eliminated)
+        joints = joints_of(structure, self.coupling, self.hessian, self.solve_eliminated)
         if joints is not None:
-            variance += joints.of_changes(changes, self.structure.plan.leaf_count)
+            variance += joints.of_changes(changes, leaves)
         return variance
 
     def factorise(
@@ -298,8 +296,7 @@ class ChainNormalEquations:
     ) -> Float[Tensor, " r"] | None:
         """The right-hand side b - B A^-1 a of the reduced system, which is factorised; None: it is not positive definite.
 
-        The arguments are added to the diagonals of A and C. Of S only the upper triangle counts. The eliminated rows are
-        in the store.
+        The arguments are added to the diagonals of A and C. Of S only the upper triangle counts.
         """
         structure, system = self.structure, self.workspace.system
         system.copy_from(self.hessian, structure.direct_tiles)
@@ -363,11 +360,8 @@ class ChainNormalEquations:
 
         Chains do not touch each other in A: one column serves as many right-hand sides as there are chains.
         """
-        factor, solved = self.workspace.factor, torch.empty_like(right_side)
-        assert factor is not None
-        for part, leads in zip(self.structure.parts, factor.leads, strict=True):
-            solved[part.block] = part.solve(leads, right_side[part.block])
-        return solved
+        assert self.workspace.factor is not None
+        return self.structure.solve(self.workspace.factor.leads, right_side)
 
     def couple(
         self, x: Float[Tensor, "e k c"], column: Int[Tensor, " e"], columns: int

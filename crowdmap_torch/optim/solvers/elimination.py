@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
+from crowdmap_torch.optim.solvers.block_elimination import Lead
 from crowdmap_torch.optim.solvers.couplings import Coupling, coupled_landmarks, couplings_of
 from crowdmap_torch.optim.solvers.dissection import dissected, incidence, near_each_other
 from crowdmap_torch.optim.solvers.layout import Layout, layout
@@ -77,6 +78,15 @@ class ChainStructure:
         couplings = {name: c.placed(self.landmarks) for name, c in couplings.items()}
         parts = _with_couplings(self.parts, couplings, self.plan, self.number)
         return replace(self, couplings=couplings, parts=parts)
+
+    def solve(
+        self, leads: Sequence[Sequence[Lead]], right_side: Float[Tensor, "e k c"]
+    ) -> Float[Tensor, "e k c"]:
+        """A^-1 of right-hand sides, by what the rounds of every part leave behind."""
+        solved = torch.empty_like(right_side)
+        for part, own in zip(self.parts, leads, strict=True):
+            solved[part.block] = part.solve(own, right_side[part.block])
+        return solved
 
     def stack(self, tangents: Mapping[str, Tensor]) -> Float[Tensor, "e k ..."]:
         """Tangents of the leaves and of the chains, one behind the other; narrower ones are padded with zeros."""
@@ -139,7 +149,7 @@ def analyse(
     size = group_size or min(64, max(4, _beside_each_other(keys, owner, landmarks.count)))
     builders, number = _builders(plan, keys, landmarks, size, k, batch_bytes)
     direct = direct_pattern(landmarks, keys, pairs)
-    reduced = reduced_pattern(direct, landmarks, *_bound(builders))
+    reduced = reduced_pattern(direct, landmarks, *_bound(builders, owner.device))
     couplings = {name: c.placed(landmarks) for name, c in couplings.items()}
     parts = [builder.part(reduced) for builder in builders]
     return ChainStructure(
@@ -189,17 +199,17 @@ def _builders(
     return builders, number
 
 
-def _bound(builders: Sequence[PartBuilder]) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+def _bound(
+    builders: Sequence[PartBuilder], device: torch.device
+) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
     """Groups of all parts, and the places of the landmarks in their windows, in the order of columns."""
-    groups, places, first = [], [], 0
+    none = torch.zeros(0, dtype=torch.long, device=device)
+    groups, places, first = [none], [none], 0
     for builder in builders:
         group, place = builder.windows.bound()
         groups.append(group + first)
         places.append(place)
         first += builder.windows.groups
-    if not groups:
-        none = torch.zeros(0, dtype=torch.long)
-        return none, none
     return torch.cat(groups), torch.cat(places)
 
 

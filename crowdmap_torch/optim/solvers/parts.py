@@ -185,7 +185,7 @@ def parts_of_chains(
     seen[:rows] = np.diff(sees.indptr)
     blocks = torch.bincount(plan.chain, minlength=chains).cpu().numpy()
     part = np.full(chains, -1)
-    parts, size = 0, 0
+    last, size = 0, 0
     for chain in np.argsort(-seen, kind="stable"):
         if part[chain] >= 0:
             continue
@@ -195,13 +195,13 @@ def parts_of_chains(
         taken = (part < 0) & (common >= _IN_COMMON * seen)
         taken[chain] = True
         if size >= _LEAST_BLOCKS:
-            parts, size = parts + 1, 0
-        part[taken] = parts
+            last, size = last + 1, 0
+        part[taken] = last
         size += blocks[taken].sum()
-    if parts and size < _LEAST_BLOCKS:
-        part[part == parts] = parts - 1
-        parts -= 1
-    if not parts:
+    if last and size < _LEAST_BLOCKS:
+        last -= 1
+        part = part.clip(max=last)
+    if not last:
         return None
     return torch.from_numpy(part).to(keys.device)
 

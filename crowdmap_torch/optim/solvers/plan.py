@@ -38,7 +38,6 @@ class EliminationPlan:
     room: Int[Tensor, " keys"] | None = None
     """What eliminated blocks may be coupled to (`planned_ahead`): the order of elimination is kept while they are coupled to
     nothing else. None: it is found whenever they are coupled to others."""
-
     part: Int[Tensor, " chains"] | None = None
     """Which of several parts each chain is of (`planned_ahead`): parts are eliminated one after the other, and those that
     see other roads have little in common. None: all at once."""

@@ -10,32 +10,20 @@ Chen 1973).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.block_elimination import leads_of
-from crowdmap_torch.optim.solvers.elimination import ChainStructure
+from crowdmap_torch.optim.solvers.block_elimination import Lead
 from crowdmap_torch.optim.solvers.parts import Part
 
 
-def diagonal_of_inverse(
-    structure: ChainStructure, diagonal: Float[Tensor, "e k k"], link: Float[Tensor, "e k k"]
-) -> Float[Tensor, "e k k"]:
-    """Diagonal blocks of the inverse of A."""
-    found = torch.empty_like(diagonal)
-    for part in structure.parts:
-        found[part.block] = _of_part(part, *part.by_place(diagonal, link))
-    return found
-
-
-def _of_part(
-    part: Part, diagonal: Float[Tensor, "p k k"], link: Float[Tensor, "p k k"]
-) -> Float[Tensor, "n k k"]:
-    """The same of a part's blocks, by their blocks by place, which are changed."""
-    k = diagonal.shape[-1]
-    leads = leads_of(part.rounds, diagonal, link)
-    found = torch.zeros_like(diagonal)
+def diagonal_of_inverse(part: Part, leads: Sequence[Lead]) -> Float[Tensor, "n k k"]:
+    """Diagonal blocks of the inverse of A, those of a part, by what its rounds leave behind."""
+    k = leads[0].whiten.shape[-1]
+    found = leads[0].whiten.new_zeros(len(part.at_place), k, k)
     # With the block that follows, of those known so far.
     crossed = torch.zeros_like(found)
     for of_round, lead in zip(reversed(part.rounds), reversed(leads), strict=True):

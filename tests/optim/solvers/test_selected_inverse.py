@@ -56,5 +56,6 @@ def test_blocks_are_those_of_the_dense_inverse(lengths: list[int], leaves: int):
         whole[i, :, i] = diagonal[i]
     inverse = torch.linalg.inv(whole.view(n * K, n * K)).view(n, K, n, K)
     expected = torch.stack([inverse[i, :, i] for i in range(n)])
-    found = diagonal_of_inverse(structure(lengths, carrier if leaves else None), diagonal, link)
+    (part,) = structure(lengths, carrier if leaves else None).parts
+    found = diagonal_of_inverse(part, part.leads(diagonal, link))
     assert torch.allclose(found, expected, atol=1e-12)
