@@ -33,8 +33,8 @@ class Rows(HasFrame):
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
-    def __getitem__(self: Table, index: Tensor) -> Table:
-        """The rows at `index` (a mask or row numbers), in that order."""
+    def __getitem__(self: Table, index: Tensor | slice) -> Table:
+        """The rows at `index` (a mask, row numbers or a slice), in that order."""
         return self._map(lambda column: column[index])
 
     def __init_subclass__(cls) -> None:

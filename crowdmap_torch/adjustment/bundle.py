@@ -15,9 +15,10 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.landmark_terms import size_class_term, slide_term
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
 from crowdmap_torch.adjustment.lane_terms import lane_point_terms
-from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
+from crowdmap_torch.adjustment.lenses import rows_by_lens
 from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
+from crowdmap_torch.adjustment.relinearisation import Relinearised, relinearised_at
 from crowdmap_torch.adjustment.shared_corner_errors import (
     KeptDetections,
     lasting_variance,
@@ -170,7 +171,8 @@ class Bundle(nn.Module):
     def _elimination(self) -> EliminationPlan:
         """Frames hang on the drift's chains, both are eliminated; what drives have to themselves or share goes last.
 
-        Landmarks are ranked as they start. From step to step lane points go over to the next control point, no further.
+        Landmarks are ranked as they start. From the start to the end lane points go over to the next control point or to
+        the one after it, hardly any further.
         """
         prior, terms = self.prior, (self._corner_term, self._lane_terms)
         seen = {name: term for make in terms for name, term in make(1.0).items()}
@@ -292,24 +294,18 @@ class Bundle(nn.Module):
     @torch.no_grad()
     def relinearise(self) -> None:
         """Takes every lens as it is where the unknowns, and the splines' matches, have the points by now."""
-        values, rows = self.values(), self.corners
-        by_corner, by_point = self._by_optics
+        values = self.values()
         self._by_mount = self.fleet.by_mount(values["pose"])
-        if len(rows):
-            sign = values["sign"][rows.sign]
-            corner = torch.nn.functional.pad(rows.template * values["size"][rows.sign], (0, 1))
-            point = se3.transform(sign, corner)
-            seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
-            self.corners = rows = relinearised(rows, self.lenses, self._corners_by_lens, seen)
-            by_corner = self.fleet.by_optics(rows, self.lenses, seen, values["pose"])
-        rows = self.lane_points
-        if len(rows):
-            coefficient, weight = self.matches.windows(self.lane_count)
-            point = (weight[..., None] * values["lane"][coefficient]).sum(1)
-            seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
-            self.lane_points = relinearised(rows, self.lenses, self._lane_points_by_lens, seen)
-            by_point = self.fleet.by_optics(self.lane_points, self.lenses, seen, values["pose"])
-        self._by_optics = (by_corner, by_point)
+        by_corner, by_point = self._by_optics
+        found = relinearised_at(
+            values,
+            Relinearised(self.corners, by_corner, self.lane_points, by_point),
+            *(self.matches, self.lane_count, self.lenses),
+            (self._corners_by_lens, self._lane_points_by_lens),
+            self.fleet,
+        )
+        self.corners, self.lane_points = found.corners, found.lane_points
+        self._by_optics = (found.by_corner, found.by_lane_point)
 
     @torch.no_grad()
     def judge(self, backend: MapBackend) -> bool:

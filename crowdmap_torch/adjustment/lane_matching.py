@@ -15,11 +15,14 @@ from crowdmap_torch.adjustment.observations import LanePointObservations
 from crowdmap_torch.clustering.neighbours import layered
 from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import plane, spline_basis
+from crowdmap_torch.processes.threads import in_order
 from crowdmap_torch.residuals.reprojection import MIN_DEPTH
-from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Rows, Tracklets
+from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Rows, Tracklets, concatenate
 
 _STEPS = 4
 """Gauss-Newton steps along the projected spline; it is nearly straight at a lane point's scale."""
+_AT_ONCE = 1 << 14
+"""Lane points that are followed at once."""
 _SLACK = 0.05
 """Knots beyond a spline's end at which a match is lost, and within it at which a lost one is taken up again."""
 
@@ -134,6 +137,22 @@ def follow(
 
     Done between steps of the solver: inside the residual it would make the Jacobian jump.
     """
+
+    def some(at: slice) -> LaneMatches:
+        return _followed(matches[at], observations[at], T_world_camera[at], coefficient, count)
+
+    every = [slice(a, a + _AT_ONCE) for a in range(0, len(matches), _AT_ONCE)]
+    return concatenate(list(in_order(some, every, coefficient.device))) if every else matches
+
+
+def _followed(
+    matches: LaneMatches,
+    observations: LanePointObservations,
+    T_world_camera: Float[Tensor, "m 4 4"],
+    coefficient: Float[Tensor, "c 3"],
+    count: Int[Tensor, " n"],
+) -> LaneMatches:
+    """The same of a few: at once they fit a processor's cache."""
     start = spline_basis.starts(count)[matches.lane]
     own = count[matches.lane]
     t = matches.t

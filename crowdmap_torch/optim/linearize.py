@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.func import vjp, vmap
 
@@ -60,9 +60,11 @@ def chunks(term: CostTerm, size: int = CHUNK_ROWS) -> Iterator[tuple[slice, Cost
 
 def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:
     """Whitened residuals of all rows."""
+    like = next(iter(values.values()))
     if not len(term):
-        return torch.zeros(0, 1, dtype=next(iter(values.values())).dtype)
-    return _whitened(term, values).mT.contiguous()
+        return like.new_zeros(0, 1)
+    pieces = [piece for _, piece in chunks(term)]
+    return torch.cat(list(in_order(lambda piece: _whitened(piece, values).mT, pieces, like.device)))
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,20 @@ class RowBlocks:
     """`J_i^T W r` of every slot i."""
     hessian: Mapping[tuple[int, int], Float[Tensor, "_ _ m"]]
     """`J_i^T W J_j` of every two slots i <= j."""
+
+    def added_up(self, group: Int[Tensor, " m"], count: int) -> RowBlocks:
+        """The sums over groups of rows."""
+
+        def of_groups(x: Float[Tensor, "*block m"]) -> Float[Tensor, "*block groups"]:
+            flat = x.reshape(-1, x.shape[-1])
+            total = flat.new_zeros(len(flat), count).index_add_(1, group, flat)
+            return total.view(*x.shape[:-1], count)
+
+        return RowBlocks(
+            self.rho.new_zeros(count).index_add_(0, group, self.rho),
+            tuple(map(of_groups, self.gradient)),
+            {slots: of_groups(block) for slots, block in self.hessian.items()},
+        )
 
 
 def row_blocks(term: CostTerm, variables: Mapping[str, Variable], values: Values) -> RowBlocks:

@@ -20,7 +20,7 @@ import torch
 from threadpoolctl import ThreadpoolController
 
 _WORTH = 4
-"""Items for each thread from which handing them over pays."""
+"""Items for each thread from which handing them over pays, where each is little work."""
 _AHEAD = 3
 """Results for each thread that may be held: whoever takes them has other things to do too."""
 T = TypeVar("T")
@@ -68,13 +68,16 @@ def repeatable(device: torch.device) -> None:
         setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010
 
 
-def in_order(function: Callable[[T], R], items: Sequence[T], device: torch.device) -> Iterator[R]:
+def in_order(
+    function: Callable[[T], R], items: Sequence[T], device: torch.device, *, worth: int = _WORTH
+) -> Iterator[R]:
     """`function` of every item, in order; on as many cores as torch may use where the device is a CPU.
 
-    Only a few results are held at a time, so that memory does not grow with their number.
+    Only a few results are held at a time, so that memory does not grow with their number. `worth` are the items for each
+    thread from which handing them over pays: few where each is much work.
     """
     threads = _kept.cores or torch.get_num_threads()
-    if device.type != "cpu" or threads == 1 or len(items) < _WORTH * threads:
+    if device.type != "cpu" or threads == 1 or len(items) < worth * threads:
         with one_core_each():
             yield from map(function, items)
         return
@@ -98,6 +101,12 @@ def in_order(function: Callable[[T], R], items: Sequence[T], device: torch.devic
         finally:
             for future in waiting:
                 future.cancel()
+
+
+def beside(one: Callable[[], T], other: Callable[[], R], *, device: torch.device) -> tuple[T, R]:
+    """What two functions give, which have nothing to do with each other."""
+    first, second = in_order(lambda function: function(), (one, other), device, worth=1)
+    return first, second  # pyright: ignore[reportReturnType]
 
 
 @lru_cache(maxsize=1)

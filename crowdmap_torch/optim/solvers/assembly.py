@@ -4,14 +4,14 @@ A row with Jacobians J_i by its slots, residual r and robust weight w adds to th
 
     g_i += J_i^T w r        H_ij += J_i^T w J_j        for its slots i <= j.
 
-`assemble` computes them in chunks, rows last; where they go is for the back end to say.
+`assemble` computes them in chunks, rows last; where they go is for the back end to say. Rows that touch the same blocks may
+be added up before they are handed over: the corners of a sign in one frame, the points of a lane's stretch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -21,20 +21,40 @@ from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, chunks, rows
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
 from crowdmap_torch.processes.threads import in_order
 
-_Blocks = TypeVar("_Blocks", bound=RowBlocks)
-_Blocks_co = TypeVar("_Blocks_co", bound=RowBlocks, covariant=True)
-_Linearize = Callable[[CostTerm, dict[str, Variable], Values], _Blocks]
+_Linearize = Callable[[CostTerm, Mapping[str, Variable], Values], RowBlocks]
 
 
 @dataclass(frozen=True)
-class TermRows(Generic[_Blocks_co]):
-    """A chunk of a term's rows, linearised."""
+class RowGroups:
+    """Rows of a term that touch the same blocks, group by group."""
+
+    order: Int[Tensor, " m"] | None = None
+    """The term's rows in the order of their groups; None: they are in that order already."""
+    of_row: Int[Tensor, " m"] | None = None
+    """In that order, the group of each; None: every row is its own."""
+
+    def added_up(self, chunk: TermRows) -> TermRows:
+        """A chunk of rows in that order as a chunk of groups, of which the first may have begun in the chunk before."""
+        if self.of_row is None or chunk.at.start == chunk.at.stop:
+            return chunk
+        group = self.of_row[chunk.at]
+        first, last = int(group[0]), int(group[-1])
+        begins = torch.ones_like(group, dtype=torch.bool)
+        begins[1:] = group[1:] != group[:-1]
+        slots = tuple((name, block[begins]) for name, block in chunk.slots)
+        blocks = chunk.blocks.added_up(group - first, last - first + 1)
+        return TermRows(chunk.term, slice(first, last + 1), slots, blocks)
+
+
+@dataclass(frozen=True)
+class TermRows:
+    """A chunk of a term's rows, linearised, or of groups of them, added up."""
 
     term: str
     at: slice
-    """Which of the term's rows they are."""
+    """Which of the term's rows, or of its groups, they are."""
     slots: tuple[tuple[str, Int[Tensor, " m"]], ...]
-    blocks: _Blocks_co
+    blocks: RowBlocks
 
 
 @dataclass(frozen=True)
@@ -48,46 +68,40 @@ class Costs:
 def assemble(
     problem: Problem,
     values: Values,
-    linearize: _Linearize[_Blocks],
-    add: Callable[[TermRows[_Blocks]], None],
+    linearize: _Linearize,
+    add: Callable[[TermRows], None],
     *,
-    order: Mapping[str, Int[Tensor, " m"] | None] | None = None,
+    groups: Mapping[str, RowGroups] | None = None,
     chunk_rows: int = CHUNK_ROWS,
 ) -> Costs:
     """The cost of every term; `add` is handed all rows, chunk by chunk, as `linearize` gives them.
 
-    Rows of a term in `order` are taken in that order.
+    Those of a term that has `groups` are handed over in their order, and added up by group.
     """
     like = next(iter(values.values()))
     by_term = {}
     for name, term in problem.terms.items():
         cost = like.new_zeros(problem.group_count)
-        chosen = (order or {}).get(name)
-        pieces = list(chunks(term if chosen is None else rows(term, chosen), chunk_rows))
-        computed = _computed(linearize, problem, [piece for _, piece in pieces], values)
-        for (at, piece), blocks in zip(pieces, computed, strict=True):
+        own = (groups or {}).get(name, RowGroups())
+        ordered = term if own.order is None else rows(term, own.order)
+
+        def linearised(
+            chunk: tuple[slice, CostTerm], name: str = name, own: RowGroups = own
+        ) -> tuple[CostTerm, Tensor, TermRows]:
+            at, piece = chunk
+            blocks = linearize(piece, problem.variables, values)
+            return piece, blocks.rho, own.added_up(TermRows(name, at, piece.slots, blocks))
+
+        pieces = list(chunks(ordered, chunk_rows))
+        for piece, rho, chunk in in_order(linearised, pieces, like.device):
             group = problem.group_of_rows(piece)
             if group is None:
-                cost += blocks.rho.sum() / 2
+                cost += rho.sum() / 2
             else:
-                cost.index_add_(0, group, blocks.rho / 2)
-            add(TermRows(name, at, piece.slots, blocks))
+                cost.index_add_(0, group, rho / 2)
+            add(chunk)
         by_term[name] = cost
     return Costs(torch.stack(list(by_term.values())).sum(0), by_term)
-
-
-def _computed(
-    linearize: _Linearize[_Blocks], problem: Problem, pieces: list[CostTerm], values: Values
-) -> Iterable[_Blocks]:
-    """Every piece of a term linearised, in order, on all cores."""
-    kinds = dict(problem.variables)
-
-    def one(piece: CostTerm) -> _Blocks:
-        return linearize(piece, kinds, values)
-
-    if not pieces:
-        return ()
-    return in_order(one, pieces, pieces[0].slots[0][1].device)
 
 
 def pairs(count: int) -> Iterator[tuple[int, int]]:
@@ -106,7 +120,7 @@ class BlockDiagonal:
             self._gradient[name] = like.new_zeros(k, n)
             self._square[name] = like.new_zeros(k, k, n)
 
-    def add(self, chunk: TermRows[RowBlocks]) -> None:
+    def add(self, chunk: TermRows) -> None:
         """Adds the rows' gradients and diagonal blocks."""
         for i, (name, block) in enumerate(chunk.slots):
             self._gradient[name].index_add_(1, block, chunk.blocks.gradient[i])

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.band_cholesky import BandFactor, cholesky_banded
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, row_blocks
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, TermRows, add_blocks, assemble
 from crowdmap_torch.optim.solvers.normal_equations import (
@@ -89,7 +89,7 @@ class _PathSums:
         self.path = like.new_zeros(self.nodes * (where.reach + 1) * d * d)
         self.path_gradient = like.new_zeros(self.nodes * d)
 
-    def add(self, chunk: TermRows[RowBlocks]) -> None:
+    def add(self, chunk: TermRows) -> None:
         """Adds a chunk of rows."""
         where = self.where
         k, d = where.landmark_dim, where.path_dim

@@ -13,10 +13,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
 from crowdmap_torch.optim.solvers.windows import Batch, Product, Round
 from crowdmap_torch.processes.threads import in_order
 
@@ -109,8 +109,8 @@ class Eliminated:
     """To be added to the neighbours' rows of the store."""
     wide: Float[Tensor, "b w gk"]
     """The whitened rows of every group's window."""
-    scattered: Float[Tensor, " ww"] | None
-    """Their products, to be added to the reduced system, unless they are subtracted run by run."""
+    scattered: tuple[Int[Tensor, " n"], Float[Tensor, " n"]] | None
+    """Where in the reduced system what of their products is to be added; None: they are subtracted run by run."""
 
 
 def eliminate(
@@ -118,8 +118,9 @@ def eliminate(
     whiten: Float[Tensor, "e k k"],
     towards: Float[Tensor, "e k _"],
     store: Float[Tensor, "rows k"],
+    pattern: TilePattern,
 ) -> Eliminated:
-    """What a batch leaves behind, by its part of the round's lead."""
+    """What a batch leaves behind, by its part of the round's lead; `pattern` is that of the reduced system."""
     groups, size, w, _ = batch.fill.shape
     k = store.shape[-1]
     rows = rows_of(batch, store)
@@ -127,14 +128,12 @@ def eliminate(
     # Adding rows as they are is several times faster than subtracting them: V carries the sign.
     fill = (whitened @ towards).view(-1, k)
     wide = whitened.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
-    scattered = None if batch.products is not None else (wide @ wide.mT).neg_().flatten()
+    scattered = None
+    if batch.products is None:
+        at = pattern.at(batch.columns[:, :, None], batch.columns[:, None])
+        product = (wide @ wide.mT).neg_()
+        scattered = at.flatten(), product.flatten()
     return Eliminated(fill, wide, scattered)
-
-
-def scatter(batch: Batch, product: Float[Tensor, " ww"], system: TileMatrix) -> None:
-    """Adds the products of a batch's windows to the reduced system, in place."""
-    at = system.pattern.at(batch.columns[:, :, None], batch.columns[:, None])
-    system.flat.index_add_(0, at.flatten(), product)
 
 
 class Products:

@@ -16,13 +16,14 @@ K^-1 F takes one more of the reduced system, with the right-hand side B A^-1 F l
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
+from crowdmap_torch.optim.solvers.block_elimination import Lead
 from crowdmap_torch.optim.solvers.chain_schur import (
     UNOBSERVED_FLOOR,
     ChainBackend,
@@ -38,7 +39,9 @@ from crowdmap_torch.optim.solvers.normal_equations import (
     failed_step,
     solved_step,
 )
+from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.processes.threads import in_order
 
 
 class BorderedBackend:
@@ -135,7 +138,7 @@ class BorderedNormalEquations:
         return self.inner.conditional_covariance(name)
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
-        """Variances of changes along chains by the last factors, landmarks and border known."""
+        """Variances of changes along chains, landmarks and border known."""
         return self.inner.variance_of_changes(changes)
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
@@ -145,25 +148,42 @@ class BorderedNormalEquations:
     def _reduced(self, added: Float[Tensor, " z"]) -> Reduced:
         """The border's own system, by the last factors of the inner one.
 
-        Variable by variable: A^-1 F of all of them is larger than what is solved.
+        Part by part and variable by variable: A^-1 F of all of them is larger than what is solved.
         """
-        plan, owner = self.inner.structure.plan, self.inner.structure.owner
-        entry, size = self._entries(), len(self.gradient)
-        T, coupled, first = self.hessian + torch.diag(added), [], 0
-        gradient, own_gradient = torch.zeros_like(self.gradient), self.inner.eliminated_gradient
-        for name, offset in self.layout.offset.items():
-            own = slice(first, first + self.layout.tangent_dim[name])
-            x = self.inner.solve_eliminated(self.link[..., own].contiguous())
-            block = plan.border[name][owner]
-            coupled.append(self.inner.couple(x, block, len(offset)).flatten(1))
-            at = entry[:, :, None] * size + entry[:, None, own]
-            T.view(-1).index_add_(0, at.flatten(), -self._by_chain(x).flatten())
-            product = (x.mT @ own_gradient[..., None])[..., 0]
-            gradient.index_add_(0, entry[owner][:, own].flatten(), product.flatten())
-            first = own.stop
-        by_landmark = torch.cat(coupled, dim=1)
+        inner, entry, size = self.inner, self._entries(), len(self.gradient)
+        owner, border = inner.structure.owner, inner.structure.plan.border
+        own, first = {}, 0
+        for name in self.layout.offset:
+            own[name] = slice(first, first + self.layout.tangent_dim[name])
+            first = own[name].stop
+
+        def through(of: tuple[Part, tuple[Lead, ...], str]) -> tuple[Through, Float[Tensor, "j c"]]:
+            part, leads, name = of
+            block, chain = part.block, owner[part.block]
+            columns = border[name][chain], len(self.layout.offset[name])
+            found = self._through(part, leads, self.link[block][..., own[name]], *columns)
+            told = (found.x.mT @ inner.eliminated_gradient[block][..., None])[..., 0]
+            by_chain = told.new_zeros(len(entry), told.shape[1]).index_add_(0, chain, told)
+            return replace(found, x=found.x[:0]), by_chain
+
+        every = [(*of, name) for name in own for of in inner.by_part()]
+        T, gradient = self.hessian + torch.diag(added), torch.zeros_like(self.gradient)
+        coupled = {
+            name: self.beside.new_zeros(
+                len(self.beside), len(offset) * self.layout.tangent_dim[name]
+            )
+            for name, offset in self.layout.offset.items()
+        }
+        for (*_, name), (found, told) in zip(
+            every, in_order(through, every, T.device, worth=1), strict=True
+        ):
+            coupled[name] += found.by_landmark
+            at = entry[:, :, None] * size + entry[:, None, own[name]]
+            T.view(-1).index_add_(0, at.flatten(), -found.by_chain.flatten())
+            gradient.index_add_(0, entry[:, own[name]].flatten(), told.flatten())
+        by_landmark = torch.cat(list(coupled.values()), dim=1)
         by_landmark = by_landmark - self.beside
-        landmarks = self.inner.solve_reduced(by_landmark)
+        landmarks = inner.solve_reduced(by_landmark)
         return Reduced(T - by_landmark.mT @ landmarks, by_landmark, landmarks, gradient)
 
     def _entries(self) -> Int[Tensor, "j b"]:
@@ -172,11 +192,32 @@ class BorderedNormalEquations:
         parts = [self.layout.entries(name, border[name]) for name in self.layout.offset]
         return torch.cat(parts, dim=1)
 
-    def _by_chain(self, x: Float[Tensor, "e k c"]) -> Float[Tensor, "j b c"]:
-        """F^T x of leaves and chains, chain by chain."""
+    def _through(
+        self,
+        part: Part,
+        leads: tuple[Lead, ...],
+        right_side: Float[Tensor, "n k c"],
+        column: Int[Tensor, " n"],
+        columns: int,
+    ) -> Through:
+        """A^-1 of right-hand sides of a part's blocks, and what it is to others; `column` is that of each in the sums."""
         structure = self.inner.structure
-        total = x.new_zeros(structure.plan.chain_count, self.link.shape[-1], x.shape[-1])
-        return total.index_add_(0, structure.owner, self.link.mT @ x)
+        x = part.solve(leads, right_side)
+        by_chain = x.new_zeros(structure.plan.chain_count, self.link.shape[-1], x.shape[-1])
+        by_chain.index_add_(0, structure.owner[part.block], self.link[part.block].mT @ x)
+        return Through(x, self.inner.couple(part, x, column, columns).flatten(1), by_chain)
+
+
+@dataclass(frozen=True)
+class Through:
+    """What right-hand sides of a part are to the landmarks and to the border, by way of its chains."""
+
+    x: Float[Tensor, "n k c"]
+    """A^-1 of them."""
+    by_landmark: Float[Tensor, "r _"]
+    """B x, column by column."""
+    by_chain: Float[Tensor, "j b c"]
+    """F^T x, chain by chain."""
 
 
 @dataclass(frozen=True)
@@ -233,16 +274,28 @@ class BorderedCovariance(LandmarkCovariance):
         equations, inner = self._equations, self._equations.inner
         j, m, owner = count, weight.shape[-1], inner.structure.owner
         of_leaves = weight.new_zeros(len(owner) - len(weight), *weight.shape[1:])
-        full = torch.cat((of_leaves, weight))
-        x = inner.solve_eliminated(full)
-        by_landmark = inner.couple(x, of[owner], j).flatten(1)
-        own = weight.new_zeros(j, m, m).index_add_(0, of[owner], full.mT @ x)
+        full, every = torch.cat((of_leaves, weight)), inner.by_part()
+
+        def through(one: tuple[Part, tuple[Lead, ...]]) -> tuple[Through, Float[Tensor, "n m m"]]:
+            part, leads = one
+            own = full[part.block]
+            found = equations._through(part, leads, own, of[owner[part.block]], j)
+            return found, own.mT @ found.x
+
+        own = weight.new_zeros(j, m, m)
+        by_landmark = weight.new_zeros(len(equations.beside), j * m)
+        by_chain = weight.new_zeros(len(of), equations.link.shape[-1], m)
+        done = in_order(through, every, weight.device, worth=1)
+        for (part, _), (found, sums) in zip(every, done, strict=True):
+            by_landmark += found.by_landmark
+            by_chain += found.by_chain
+            own.index_add_(0, of[owner[part.block]], sums)
         landmarks = self._held.solve(by_landmark)
         by_border = self._reduced.by_landmark.mT @ landmarks
         # Of F^T x the sums that a chain is of have the rows of its own blocks.
         entry, sums = equations._entries(), of[:, None] * m + torch.arange(m, device=of.device)
         at = entry[..., None] * (j * m) + sums[:, None]
-        by_border.view(-1).index_add_(0, at.flatten(), equations._by_chain(x).flatten())
+        by_border.view(-1).index_add_(0, at.flatten(), by_chain.flatten())
         joint = torch.block_diag(*own) + by_landmark.mT @ landmarks
         joint = joint + by_border.mT @ self._border @ by_border
         every = torch.arange(j, device=owner.device)

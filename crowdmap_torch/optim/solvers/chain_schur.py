@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -33,11 +33,10 @@ from crowdmap_torch.optim.solvers.block_elimination import (
     eliminate,
     fill_chain,
     lead_of,
-    scatter,
 )
 from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
-from crowdmap_torch.optim.solvers.joints import joints_of
+from crowdmap_torch.optim.solvers.known_landmarks import KnownLandmarks
 from crowdmap_torch.optim.solvers.landmark_covariance import LandmarkCovariance
 from crowdmap_torch.optim.solvers.layout import SparsityPattern
 from crowdmap_torch.optim.solvers.normal_equations import (
@@ -50,7 +49,6 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 )
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
-from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.optim.solvers.windows import Batch, Round
@@ -97,13 +95,14 @@ class ChainBackend:
             name: workspace.coupling(
                 name, (*coupling.column.shape, structure.width[coupling.variable])
             )
-            for name, coupling in structure.couplings.items()
+            for name, coupling in structure.couplings.factors.items()
         }
         sums = ReducibleSums(structure, problem, values, coupling)
-        order = {name: coupling.order for name, coupling in structure.couplings.items()}
+        groups = {name: term.rows for name, term in structure.couplings.terms.items()}
         costs = assemble(
-            problem, values, row_blocks, sums.add, order=order, chunk_rows=self.chunk_rows
+            problem, values, row_blocks, sums.add, groups=groups, chunk_rows=self.chunk_rows
         )
+        sums.add_lots()
         return _equations(costs, sums, workspace), sums
 
     def prepare(self, problem: Problem, values: Values) -> tuple[ChainStructure, Workspace]:
@@ -232,64 +231,23 @@ class ChainNormalEquations:
 
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, the landmarks known."""
-        found = self._diagonal_of_inverse()
+        found = self.known.of_blocks()
         return self.structure.unstack(found)[name][..., : self.structure.width[name]]
-
-    def _diagonal_of_inverse(self) -> Float[Tensor, "e k k"]:
-        """Covariance of every eliminated block, the landmarks known but for the joints of chains."""
-        structure = self.structure
-        leads = tuple(part.leads(self.diagonal, self.link) for part in structure.parts)
-        found = torch.empty_like(self.diagonal)
-        for part, own in zip(structure.parts, leads, strict=True):
-            found[part.block] = diagonal_of_inverse(part, own)
-        joints = joints_of(
-            *(structure, self.coupling, self.hessian), partial(structure.solve, leads)
-        )
-        if joints is not None:
-            for part in structure.parts:
-                found[part.block] += joints.of_blocks(part.block)
-        return found
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
         """Variance of each leaf's numbers less those of the block that carries it, landmarks and border known."""
-        plan = self.structure.plan
-        assert plan.carrier is not None
-        found = self._diagonal_of_inverse()
-        of_carrier = found[plan.leaf_count :][plan.carrier]
-        alone = torch.linalg.inv(self.diagonal[: plan.leaf_count])
-        # The leaf goes with its carrier by -H^-1 times their link.
-        lags = alone @ self.link[: plan.leaf_count]
-        lags.diagonal(dim1=-2, dim2=-1).add_(1)
-        left = alone + lags @ of_carrier @ lags.mT
-        assert plan.leaves is not None
-        return left.diagonal(dim1=-2, dim2=-1)[:, : self.structure.width[plan.leaves]]
+        return self.known.of_leaves()
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
-        """Variances of the changes between blocks of chains, by the last factors: leaves marginalised, all else known."""
-        structure, factor = self.structure, self.workspace.factor
-        assert factor is not None
-        of, leaves = changes.of, structure.plan.leaf_count
-        variance = self.gradient.new_zeros(len(changes.pair), of.shape[1])
-        # A change counts at either end, which need not be in one part.
-        end = torch.arange(2, device=of.device).repeat_interleave(len(changes.pair))
-        row = torch.arange(len(changes.pair), device=of.device).repeat(2)
-        block = changes.pair.T.flatten() + leaves
-        of_part, number = structure.plan.part_of_blocks[block], structure.number[block]
-        for i, (part, leads) in enumerate(zip(structure.parts, factor.leads, strict=True)):
-            mine = of_part == i
-            # One at a time: all of them are several times as large as what is solved.
-            for column in torch.unique(changes.column[row[mine]]).tolist():
-                here = torch.nonzero(mine & (changes.column[row] == column))[:, 0]
-                sign = (2.0 * end[here] - 1)[:, None, None]
-                at = number[here] - part.leaf_count
-                right_side = of.new_zeros(len(part.block) - part.leaf_count, *of.shape)
-                right_side[at] = sign * of
-                found = part.solve_chains(leads, right_side)[at]
-                variance.index_add_(0, row[here], (sign * of * found).sum(1))
-        joints = joints_of(structure, self.coupling, self.hessian, self.solve_eliminated)
-        if joints is not None:
-            variance += joints.of_changes(changes, leaves)
-        return variance
+        """Variances of the changes between blocks of chains: leaves marginalised, landmarks and border known."""
+        return self.known.of_changes(changes)
+
+    @cached_property
+    def known(self) -> KnownLandmarks:
+        """Covariances of eliminated blocks, the landmarks known."""
+        return KnownLandmarks.of(
+            *(self.structure, self.diagonal, self.link), self.coupling, self.hessian
+        )
 
     def factorise(
         self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"]
@@ -316,6 +274,7 @@ class ChainNormalEquations:
         self, part: Part, added: Float[Tensor, "e k"], products: Products
     ) -> tuple[Lead, ...]:
         """Takes a part's chains off the reduced system, round by round, and hands back what the rounds leave behind."""
+        structure, system = self.structure, self.workspace.system
         store = self._filled_store(part)
         diagonal, link = part.by_place(self.diagonal, self.link, added)
         leads = []
@@ -326,13 +285,14 @@ class ChainNormalEquations:
 
             def eliminated(batch: Batch, of_round: Round = of_round, lead: Lead = lead):
                 here = of_round.of_batch(batch)
-                return eliminate(batch, lead.whiten[here], lead.towards[here], store)
+                own = lead.whiten[here], lead.towards[here]
+                return eliminate(batch, *own, store, structure.reduced)
 
             done = in_order(eliminated, of_round.batches, store.device)
             for batch, found in zip(of_round.batches, done, strict=True):
                 store.index_add_(0, batch.fill.flatten(), found.fill)
                 if found.scattered is not None:
-                    scatter(batch, found.scattered, self.workspace.system)
+                    system.flat.index_add_(0, *found.scattered)
                 elif batch.products is not None:
                     products.add(batch.products, found.wide)
         return tuple(leads)
@@ -363,16 +323,21 @@ class ChainNormalEquations:
         assert self.workspace.factor is not None
         return self.structure.solve(self.workspace.factor.leads, right_side)
 
+    def by_part(self) -> list[tuple[Part, tuple[Lead, ...]]]:
+        """The parts, and what their rounds left behind when they were last eliminated."""
+        assert self.workspace.factor is not None
+        return list(zip(self.structure.parts, self.workspace.factor.leads, strict=True))
+
     def couple(
-        self, x: Float[Tensor, "e k c"], column: Int[Tensor, " e"], columns: int
+        self, part: Part, x: Float[Tensor, "n k c"], column: Int[Tensor, " n"], columns: int
     ) -> Float[Tensor, "r columns c"]:
-        """B x, the products of the eliminated blocks added up in a column of the result each."""
+        """B x of a part, the products of its eliminated blocks added up in a column of the result each."""
         total = x.new_zeros(len(self.gradient) * columns, x.shape[-1])
-        for name, block in self.coupling.items():
-            coupling = self.structure.couplings[name]
-            for at in range(0, len(block), CHUNK_ROWS):
-                here = slice(at, at + CHUNK_ROWS)
-                of = coupling.block[here]
+        for name, own in part.factors.items():
+            coupling, block = self.structure.couplings.factors[name], self.coupling[name]
+            for at in range(own.start, own.stop, CHUNK_ROWS):
+                here = slice(at, min(at + CHUNK_ROWS, own.stop))
+                of = self.structure.number[coupling.block[here]]
                 entry = coupling.column[here] * columns + column[of][:, None]
                 product = block[here] @ x[of, : block.shape[2]]
                 total.index_add_(0, entry.flatten(), product.flatten(0, 1))
@@ -382,7 +347,7 @@ class ChainNormalEquations:
         """B^T y."""
         total = torch.zeros_like(self.eliminated_gradient)
         for name, block in self.coupling.items():
-            coupling = self.structure.couplings[name]
+            coupling = self.structure.couplings.factors[name]
             product = (y[coupling.column][:, None] @ block)[:, 0]
             total[:, : product.shape[1]].index_add_(0, coupling.block, product)
         return total

@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import RowBlocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, add_blocks, pairs
-from crowdmap_torch.optim.solvers.elimination import ChainStructure, Coupling, padded
+from crowdmap_torch.optim.solvers.couplings import TermFactors
+from crowdmap_torch.optim.solvers.elimination import ChainStructure, padded
+from crowdmap_torch.optim.solvers.layout import Layout
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 
 
@@ -31,7 +32,7 @@ class ChainSums:
         }
         """Block of each with its chain's block of every variable of the border."""
 
-    def add(self, chunk: TermRows[RowBlocks]) -> None:
+    def add(self, chunk: TermRows) -> None:
         """Adds a chunk of rows."""
         self.by_variable.add(chunk)
         first = self.structure.plan.first_block
@@ -101,35 +102,63 @@ class ReducibleSums(ChainSums):
         self.beside = like.new_zeros(dim, structure.border.dim)
         """Blocks between landmarks and the border."""
         self._among = like.new_zeros(structure.border.dim, structure.border.dim)
-        for name, blocks in coupling.items():
-            if structure.couplings[name].factor_of_row is not None:
-                blocks.zero_()
+        self._lots: dict[tuple[str, int, int], Tensor] = {}
+        """By term and two of its slots that stay, their blocks by lot."""
+        for blocks in coupling.values():
+            blocks.zero_()
 
-    def add(self, chunk: TermRows[RowBlocks]) -> None:
+    def add(self, chunk: TermRows) -> None:
         """Adds a chunk of rows."""
         super().add(chunk)
-        where, border = self.structure.where, self.structure.border
+        first = self.structure.plan.first_block
+        term = self.structure.couplings.terms.get(chunk.term)
         for i, j in pairs(len(chunk.slots)):
-            (name, block), (other, block_of_other) = chunk.slots[i], chunk.slots[j]
+            one, other = chunk.slots[i], chunk.slots[j]
             square = chunk.blocks.hessian[i, j]
-            if name in where.offset and other in where.offset:
-                row, column = where.offset[name][block], where.offset[other][block_of_other]
-                self._matrix.add(row, column, square)
-                self._matrix.add(column, row, square.transpose(0, 1))
-            elif name in where.offset and other in border.offset:
-                row, column = where.offset[name][block], border.offset[other][block_of_other]
-                add_blocks(self.beside.view(-1), row, column, border.dim, square)
-            elif name in border.offset and other in where.offset:
-                row, column = where.offset[other][block_of_other], border.offset[name][block]
-                square = square.transpose(0, 1)
-                add_blocks(self.beside.view(-1), row, column, border.dim, square)
-            elif name in border.offset and other in border.offset:
-                row, column = border.offset[name][block], border.offset[other][block_of_other]
-                add_blocks(self._among.view(-1), row, column, border.dim, square)
-                add_blocks(self._among.view(-1), column, row, border.dim, square.transpose(0, 1))
-        if chunk.term in self.coupling:
-            coupling = self.structure.couplings[chunk.term]
-            _add_coupling(self.coupling[chunk.term], coupling, chunk, set(border.offset))
+            if one[0] in first or other[0] in first:
+                continue
+            if term is None:
+                self._add_between(one, other, square)
+                continue
+            # Many frames see the same stretch of a lane.
+            key = chunk.term, i, j
+            if key not in self._lots:
+                size = (*square.shape[:2], len(term.slots[0][1]))
+                self._lots[key] = square.new_zeros(size)
+            into = self._lots[key].flatten(0, 1)
+            into.index_add_(1, term.lot[chunk.at], square.flatten(0, 1))
+        if term is not None:
+            _add_coupling(self.coupling[term.coupling], term, chunk, self.structure.where)
+
+    def _add_between(
+        self,
+        one: tuple[str, Int[Tensor, " m"]],
+        other: tuple[str, Int[Tensor, " m"]],
+        square: Float[Tensor, "k l m"],
+    ) -> None:
+        """Adds the blocks between two variables that stay."""
+        where, border = self.structure.where, self.structure.border
+        if one[0] in border.offset and other[0] in where.offset:
+            one, other, square = other, one, square.transpose(0, 1)
+        (name, block), (name_of_other, block_of_other) = one, other
+        row = (where if name in where.offset else border).offset[name][block]
+        right = where if name_of_other in where.offset else border
+        column = right.offset[name_of_other][block_of_other]
+        if right is where:
+            self._matrix.add(row, column, square)
+            self._matrix.add(column, row, square.transpose(0, 1))
+            return
+        into = self.beside if name in where.offset else self._among
+        add_blocks(into.view(-1), row, column, border.dim, square)
+        if into is self._among:
+            add_blocks(into.view(-1), column, row, border.dim, square.transpose(0, 1))
+
+    def add_lots(self) -> None:
+        """Adds what was summed by lot, once all rows are there."""
+        for (name, i, j), square in self._lots.items():
+            slots = self.structure.couplings.terms[name].slots
+            self._add_between(slots[i], slots[j], square)
+        self._lots = {}
 
     def landmark_hessian(self) -> TileMatrix:
         """The matrix C."""
@@ -159,18 +188,15 @@ class ReducibleSums(ChainSums):
 
 
 def _add_coupling(
-    total: Float[Tensor, "f w _"], coupling: Coupling, chunk: TermRows[RowBlocks], border: set[str]
+    total: Float[Tensor, "f w _"], term: TermFactors, chunk: TermRows, where: Layout
 ) -> None:
     """Adds the blocks between the rows' eliminated slot and those of landmarks, in place."""
-    slot, start = coupling.slot, 0
-    for other in range(len(chunk.slots)):
-        if other == slot or chunk.slots[other][0] in border:
+    slot, start = term.slot, 0
+    for other, (name, _) in enumerate(chunk.slots):
+        if name not in where.offset:
             continue
         block = chunk.blocks.hessian[min(slot, other), max(slot, other)]
         block = block.permute(2, 1, 0) if slot < other else block.permute(2, 0, 1)
         here = slice(start, start + block.shape[1])
         start = here.stop
-        if coupling.factor_of_row is None:
-            total[chunk.at, here] = block
-        else:
-            total[:, here].index_add_(0, coupling.factor_of_row[chunk.at], block)
+        total[chunk.at, here] += block

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, row_blocks
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import TermRows, add_blocks, assemble
 from crowdmap_torch.optim.solvers.layout import Layout, layout, read_entries
@@ -39,7 +39,7 @@ class DenseBackend:
         hessian = like.new_zeros(problem.group_count, where.dim, where.dim)
         gradient = like.new_zeros(problem.group_count, where.dim)
 
-        def add(chunk: TermRows[RowBlocks]) -> None:
+        def add(chunk: TermRows) -> None:
             name, block = chunk.slots[0]
             group = where.group[name][block]
             column = [where.offset[name][block] for name, block in chunk.slots]

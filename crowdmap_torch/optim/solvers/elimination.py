@@ -25,7 +25,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.block_elimination import Lead
-from crowdmap_torch.optim.solvers.couplings import Coupling, coupled_landmarks, couplings_of
+from crowdmap_torch.optim.solvers.couplings import Couplings, couplings_of
 from crowdmap_torch.optim.solvers.dissection import dissected, incidence, near_each_other
 from crowdmap_torch.optim.solvers.layout import Layout, layout
 from crowdmap_torch.optim.solvers.parts import Part, PartBuilder, parts_of_chains
@@ -38,6 +38,11 @@ from crowdmap_torch.optim.solvers.tile_patterns import (
     reduced_pattern,
 )
 from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, WindowBuilder
+from crowdmap_torch.processes.threads import in_order
+
+_SLIDES = (-2, -1, 1, 2)
+"""Landmarks that rows may go over to, from where they are: with room for the next one alone, 6 of 280,000 couplings of 25 km
+have none, and the whole order is found anew at every step."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ class ChainStructure:
     """Tangents of a leaf and of a chain's block, by variable; leaves may be narrower, and are padded to the chains'."""
     where: Layout
     """The reduced system: all variables but those that the plan names."""
-    couplings: dict[str, Coupling]
+    couplings: Couplings
     parts: tuple[Part, ...]
     """Chains that are eliminated together, part after part."""
     number: Int[Tensor, " e"]
@@ -73,9 +78,9 @@ class ChainStructure:
         """Rows of the store: of the part that needs most."""
         return max((part.store_rows for part in self.parts), default=0)
 
-    def with_couplings(self, couplings: Mapping[str, Coupling]) -> ChainStructure:
+    def with_couplings(self, couplings: Couplings) -> ChainStructure:
         """The same order for other rows, for whose couplings it has room."""
-        couplings = {name: c.placed(self.landmarks) for name, c in couplings.items()}
+        couplings = couplings.placed(self.landmarks)
         parts = _with_couplings(self.parts, couplings, self.plan, self.number)
         return replace(self, couplings=couplings, parts=parts)
 
@@ -83,9 +88,16 @@ class ChainStructure:
         self, leads: Sequence[Sequence[Lead]], right_side: Float[Tensor, "e k c"]
     ) -> Float[Tensor, "e k c"]:
         """A^-1 of right-hand sides, by what the rounds of every part leave behind."""
+
+        def of_part(of: tuple[Part, Sequence[Lead]]) -> Float[Tensor, "n k c"]:
+            part, own = of
+            return part.solve(own, right_side[part.block])
+
         solved = torch.empty_like(right_side)
-        for part, own in zip(self.parts, leads, strict=True):
-            solved[part.block] = part.solve(own, right_side[part.block])
+        every = list(zip(self.parts, leads, strict=True))
+        done = in_order(of_part, every, right_side.device, worth=1)
+        for part, found in zip(self.parts, done, strict=True):
+            solved[part.block] = found
         return solved
 
     def stack(self, tangents: Mapping[str, Tensor]) -> Float[Tensor, "e k ..."]:
@@ -150,7 +162,7 @@ def analyse(
     builders, number = _builders(plan, keys, landmarks, size, k, batch_bytes)
     direct = direct_pattern(landmarks, keys, pairs)
     reduced = reduced_pattern(direct, landmarks, *_bound(builders, owner.device))
-    couplings = {name: c.placed(landmarks) for name, c in couplings.items()}
+    couplings = couplings.placed(landmarks)
     parts = [builder.part(reduced) for builder in builders]
     return ChainStructure(
         plan=plan,
@@ -214,20 +226,19 @@ def _bound(
 
 
 def _with_couplings(
-    parts: Sequence[Part],
-    couplings: Mapping[str, Coupling],
-    plan: EliminationPlan,
-    number: Int[Tensor, " e"],
+    parts: Sequence[Part], couplings: Couplings, plan: EliminationPlan, number: Int[Tensor, " e"]
 ) -> tuple[Part, ...]:
     """The parts with the factors of the couplings, which follow each other part by part."""
     part, bound = plan.part_of_blocks, torch.arange(len(parts) + 1, device=number.device)
     ends = {
         name: torch.searchsorted(part[c.block].contiguous(), bound).tolist()
-        for name, c in couplings.items()
+        for name, c in couplings.factors.items()
     }
     return tuple(
         one.with_couplings(
-            couplings, {name: slice(end[i], end[i + 1]) for name, end in ends.items()}, number
+            couplings.factors,
+            {name: slice(end[i], end[i + 1]) for name, end in ends.items()},
+            number,
         )
         for i, one in enumerate(parts)
     )
@@ -245,7 +256,7 @@ def planned_ahead(
     """The plan with what the rows show of the landmarks, which serves them still when they have changed a little.
 
     Landmarks are ranked such that those coupled to one block are near each other, chains parted by what they see (both
-    worked out on the CPU), and there is room for rows that go over to the next landmark, by number, of the `sliding`
+    worked out on the CPU), and there is room for rows that go over to the next two landmarks, by number, of the `sliding`
     variables.
     """
     _, landmarks, _, keys = _touched(problem, values, plan)
@@ -254,7 +265,7 @@ def planned_ahead(
     for name in sliding:
         first, number = landmarks.first[name], len(values[name])
         at = keys % count - first
-        for step in (-1, 1):
+        for step in _SLIDES:
             goes = (at >= 0) & (at < number) & (at + step >= 0) & (at + step < number)
             room.append(keys[goes] + step)
     return replace(
@@ -267,12 +278,12 @@ def planned_ahead(
 
 def _touched(
     problem: Problem, values: Values, plan: EliminationPlan
-) -> tuple[Layout, LandmarkBlocks, dict[str, Coupling], Int[Tensor, " keys"]]:
+) -> tuple[Layout, LandmarkBlocks, Couplings, Int[Tensor, " keys"]]:
     """The reduced system, its blocks, and what of it the eliminated blocks are coupled to, by term and as keys."""
     where = layout(problem, values, skip=(*plan.first_block, *plan.border))
     landmarks = LandmarkBlocks.of(where, plan.chain.device)
     couplings = couplings_of(problem.terms, plan, landmarks)
-    return where, landmarks, couplings, coupled_landmarks(couplings, landmarks)
+    return where, landmarks, couplings, couplings.touched(landmarks)
 
 
 def _all_but(problem: Problem, names: Collection[str]) -> tuple[str, ...]:

@@ -82,7 +82,7 @@ def joints_of(
     E = like.new_zeros(len(structure.owner), structure.width[plan.chains], 2 * width)
     first = structure.landmarks.first[plan.joints]
     for name, block in coupling.items():
-        couples = structure.couplings[name]
+        couples = structure.couplings.factors[name]
         joint = couples.landmark[:, 0] - first
         here = torch.nonzero((joint >= 0) & (joint < count))[:, 0]
         if couples.landmark.shape[1] != 1 or not len(here):

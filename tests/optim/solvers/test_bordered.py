@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from worlds.bordered_chains import drives, rows_of, shared_drives, wandering_drives
@@ -94,3 +96,25 @@ def test_a_chain_that_is_not_positive_definite_moves_nothing():
     step = normal.solve(torch.tensor([1e-9], dtype=torch.float64))
     assert not bool(step.solved)
     assert not any(delta.any() for delta in step.delta.values())
+
+
+def test_terms_that_touch_the_same_blocks_share_their_factors():
+    """A second term as the first one: the step is the dense one, and B takes no more memory."""
+    problem, values, plan = drives()
+    sighting = problem.terms["sighting"]
+    again = replace(sighting, constants=(sighting.constants[0] + 0.3,))
+    both = replace(problem, terms={**problem.terms, "again": again})
+    normal = BorderedBackend(plan).assemble(both, values)
+    assert list(normal.inner.coupling) == ["sighting"]
+    damping = torch.full((1,), 1e-3, dtype=torch.double)
+    found, expected = normal.solve(damping), DenseBackend().assemble(both, values).solve(damping)
+    for name, delta in expected.delta.items():
+        torch.testing.assert_close(found.delta[name], delta, rtol=1e-8, atol=1e-10)
+    # Seen in another order, the blocks are the same ones.
+    turned = torch.arange(len(again)).flip(0)
+    slots = tuple((name, block[turned]) for name, block in again.slots)
+    again = replace(again, slots=slots, constants=(again.constants[0][turned],))
+    other = replace(problem, terms={**problem.terms, "again": again})
+    same = BorderedBackend(plan).assemble(other, values)
+    assert list(same.inner.coupling) == ["sighting"]
+    torch.testing.assert_close(same.inner.coupling["sighting"], normal.inner.coupling["sighting"])

@@ -1,0 +1,67 @@
+"""What observations say of the unknowns, taken anew where these are by now: lenses, and what cars have wrong of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from crowdmap_torch.adjustment.calibration import ByOptics, Fleet
+from crowdmap_torch.adjustment.lane_matching import LaneMatches
+from crowdmap_torch.adjustment.lenses import relinearised
+from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.processes.threads import beside
+
+
+@dataclass(frozen=True)
+class Relinearised:
+    """Observations with every lens as it is where their points are, and their derivatives by their cars' optics."""
+
+    corners: CornerObservations
+    by_corner: ByOptics
+    lane_points: LanePointObservations
+    by_lane_point: ByOptics
+
+
+def relinearised_at(
+    values: Mapping[str, Tensor],
+    before: Relinearised,
+    matches: LaneMatches,
+    lane_count: Int[Tensor, " n"],
+    lenses: Sequence[Camera],
+    by_lens: tuple[Sequence[Int[Tensor, " _"]], Sequence[Int[Tensor, " _"]]],
+    fleet: Fleet,
+) -> Relinearised:
+    """Those with the unknowns, and the splines' matches, where they are; `by_lens` are the `rows_by_lens` of both kinds.
+
+    Without a point of a kind its derivatives stay.
+    """
+
+    def corners() -> tuple[CornerObservations, ByOptics]:
+        rows = before.corners
+        if not len(rows):
+            return rows, before.by_corner
+        sign = values["sign"][rows.sign]
+        corner = torch.nn.functional.pad(rows.template * values["size"][rows.sign], (0, 1))
+        point = se3.transform(sign, corner)
+        seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
+        rows = relinearised(rows, lenses, by_lens[0], seen)
+        return rows, fleet.by_optics(rows, lenses, seen, values["pose"])
+
+    def lane_points() -> tuple[LanePointObservations, ByOptics]:
+        rows = before.lane_points
+        if not len(rows):
+            return rows, before.by_lane_point
+        coefficient, weight = matches.windows(lane_count)
+        point = (weight[..., None] * values["lane"][coefficient]).sum(1)
+        seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
+        rows = relinearised(rows, lenses, by_lens[1], seen)
+        return rows, fleet.by_optics(rows, lenses, seen, values["pose"])
+
+    of_corners, of_points = beside(corners, lane_points, device=values["pose"].device)
+    return Relinearised(*of_corners, *of_points)

@@ -1,0 +1,119 @@
+"""What is uncertain of eliminated blocks where landmarks and border are known: of A^-1 what is asked for.
+
+Where drives are cut, the joints are landmarks by their place alone: what they add counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from crowdmap_torch.optim.solvers.block_elimination import Lead
+from crowdmap_torch.optim.solvers.elimination import ChainStructure
+from crowdmap_torch.optim.solvers.joints import Joints, joints_of
+from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
+from crowdmap_torch.optim.solvers.parts import Part
+from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.processes.threads import in_order
+
+
+@dataclass(frozen=True)
+class KnownLandmarks:
+    """The covariances of chains and leaves, undamped, landmarks and border known; letters as in `chain_schur`."""
+
+    structure: ChainStructure
+    diagonal: Float[Tensor, "e k k"] = field(repr=False)
+    link: Float[Tensor, "e k k"] = field(repr=False)
+    leads: tuple[tuple[Lead, ...], ...] = field(repr=False)
+    """What the elimination of A alone leaves behind, by part and round."""
+    joints: Joints | None = field(repr=False)
+
+    @classmethod
+    def of(
+        cls,
+        structure: ChainStructure,
+        diagonal: Float[Tensor, "e k k"],
+        link: Float[Tensor, "e k k"],
+        coupling: Mapping[str, Float[Tensor, "f w _"]],
+        hessian: TileMatrix,
+    ) -> KnownLandmarks:
+        """That of normal equations."""
+
+        def led(part: Part) -> tuple[Lead, ...]:
+            return part.leads(diagonal, link)
+
+        leads = tuple(in_order(led, structure.parts, diagonal.device, worth=1))
+        joints = joints_of(structure, coupling, hessian, partial(structure.solve, leads))
+        return cls(structure, diagonal, link, leads, joints)
+
+    def of_blocks(self) -> Float[Tensor, "e k k"]:
+        """Covariance of every eliminated block."""
+
+        def of_part(of: tuple[Part, Sequence[Lead]]) -> Float[Tensor, "n k k"]:
+            part, leads = of
+            own = diagonal_of_inverse(part, leads)
+            return own if self.joints is None else own + self.joints.of_blocks(part.block)
+
+        found = torch.empty_like(self.diagonal)
+        parts = self.structure.parts
+        done = in_order(of_part, list(zip(parts, self.leads, strict=True)), found.device, worth=1)
+        for part, own in zip(parts, done, strict=True):
+            found[part.block] = own
+        return found
+
+    def of_leaves(self) -> Float[Tensor, "l k"]:
+        """Variance of each leaf's numbers less those of the block that carries it."""
+        plan = self.structure.plan
+        assert plan.carrier is not None
+        of_carrier = self.of_blocks()[plan.leaf_count :][plan.carrier]
+        alone = torch.linalg.inv(self.diagonal[: plan.leaf_count])
+        # The leaf goes with its carrier by -H^-1 times their link.
+        lags = alone @ self.link[: plan.leaf_count]
+        lags.diagonal(dim1=-2, dim2=-1).add_(1)
+        left = alone + lags @ of_carrier @ lags.mT
+        assert plan.leaves is not None
+        return left.diagonal(dim1=-2, dim2=-1)[:, : self.structure.width[plan.leaves]]
+
+    def of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
+        """Variances of the changes between blocks of chains, leaves marginalised."""
+        structure, of = self.structure, changes.of
+        leaves = structure.plan.leaf_count
+        variance = of.new_zeros(len(changes.pair), of.shape[1])
+        # A change counts at either end, which need not be in one part.
+        end = torch.arange(2, device=of.device).repeat_interleave(len(changes.pair))
+        row = torch.arange(len(changes.pair), device=of.device).repeat(2)
+        block = changes.pair.T.flatten() + leaves
+        of_part, number = structure.plan.part_of_blocks[block], structure.number[block]
+        # One column at a time: all of them are several times as large as what is solved.
+        every = [
+            (part, leads, here)
+            for i, (part, leads) in enumerate(zip(structure.parts, self.leads, strict=True))
+            for here in _by_column(torch.nonzero(of_part == i)[:, 0], changes.column[row])
+        ]
+
+        def solved(of_one: tuple[Part, Sequence[Lead], Tensor]) -> Float[Tensor, "r m"]:
+            part, leads, here = of_one
+            sign = (2.0 * end[here] - 1)[:, None, None]
+            at = number[here] - part.leaf_count
+            right_side = of.new_zeros(len(part.block) - part.leaf_count, *of.shape)
+            right_side[at] = sign * of
+            found = part.solve_chains(leads, right_side)[at]
+            return (sign * of * found).sum(1)
+
+        for (*_, here), found in zip(every, in_order(solved, every, of.device), strict=True):
+            variance.index_add_(0, row[here], found)
+        if self.joints is not None:
+            variance += self.joints.of_changes(changes, leaves)
+        return variance
+
+
+def _by_column(row: Tensor, column: Tensor) -> list[Tensor]:
+    """Rows of one column each, column by column."""
+    own = column[row]
+    return [row[own == one] for one in torch.unique(own).tolist()]
