@@ -153,7 +153,7 @@ class Bundle(nn.Module):
         self.config = config
         # Where each lane point was followed to is part of the state: matching starts from there.
         matches = observations.matches
-        self._match_lane = matches.lane
+        self._match_lane, self._match_begun = matches.lane, matches.t
         self.register_buffer("match_t", matches.t.clone())
         self.register_buffer("match_normal", matches.normal_px.clone())
         self.register_buffer("match_valid", matches.valid.clone())
@@ -171,8 +171,8 @@ class Bundle(nn.Module):
     def _elimination(self) -> EliminationPlan:
         """Frames hang on the drift's chains, both are eliminated; what drives have to themselves or share goes last.
 
-        Landmarks are ranked as they start. From the start to the end lane points go over to the next control point or to
-        the one after it, hardly any further.
+        Landmarks are ranked as they start. Lane points slide to the next control point and no further: the order that is
+        found here is kept.
         """
         prior, terms = self.prior, (self._corner_term, self._lane_terms)
         seen = {name: term for make in terms for name, term in make(1.0).items()}
@@ -245,7 +245,9 @@ class Bundle(nn.Module):
         values, made_with = self.values(), self._scales()
         if len(self.lane_points):
             pose = values["pose"][self.lane_points.frame]
-            found = follow(self.matches, self.lane_points, pose, values["lane"], self.lane_count)
+            splines = values["lane"], self.lane_count
+            begun = self._match_begun
+            found = follow(self.matches, self.lane_points, pose, *splines, begun=begun)
             self.match_t, self.match_normal = found.t, found.normal_px
             self.match_valid = found.valid
         self.relinearise()

@@ -132,14 +132,20 @@ def follow(
     T_world_camera: Float[Tensor, "m 4 4"],
     coefficient: Float[Tensor, "c 3"],
     count: Int[Tensor, " n"],
+    *,
+    begun: Float[Tensor, " m"] | None = None,
 ) -> LaneMatches:
     """The matches moved to the closest points of the projected splines, from where they were (V-B).
 
-    Done between steps of the solver: inside the residual it would make the Jacobian jump.
+    Done between steps of the solver: inside the residual it would make the Jacobian jump. Those that had `begun` with these
+    parameters slide no further than the stretches between control points next to theirs.
     """
 
     def some(at: slice) -> LaneMatches:
-        return _followed(matches[at], observations[at], T_world_camera[at], coefficient, count)
+        where = T_world_camera[at], coefficient, count
+        return _followed(
+            matches[at], observations[at], *where, None if begun is None else begun[at]
+        )
 
     every = [slice(a, a + _AT_ONCE) for a in range(0, len(matches), _AT_ONCE)]
     return concatenate(list(in_order(some, every, coefficient.device))) if every else matches
@@ -151,6 +157,7 @@ def _followed(
     T_world_camera: Float[Tensor, "m 4 4"],
     coefficient: Float[Tensor, "c 3"],
     count: Int[Tensor, " n"],
+    begun: Float[Tensor, " m"] | None,
 ) -> LaneMatches:
     """The same of a few: at once they fit a processor's cache."""
     start = spline_basis.starts(count)[matches.lane]
@@ -159,11 +166,16 @@ def _followed(
     M = observations.matrix @ T_world_camera[:, :3, :3].mT
     position = T_world_camera[:, :3, 3]
     last = (own - 1).to(t)
+    # Half a knot beyond either end is far enough to see that the point is not on this spline.
+    least, most = torch.full_like(t, -0.5), last + 0.5
+    if begun is not None:
+        begun = begun.floor()
+        least = torch.maximum(least, begun - 1)
+        most = torch.minimum(most, torch.nextafter(begun + 2, begun))
     y, error, tangent = _projected(t, start, own, coefficient, M, position)
     for _ in range(_STEPS):
         change = (error * tangent).sum(-1) / tangent.square().sum(-1).clamp_min(1e-12)
-        # Half a knot beyond either end is far enough to see that the point is not on this spline.
-        t = torch.minimum((t - change.clamp(-2, 2)).clamp_min(-0.5), last + 0.5)
+        t = torch.minimum(torch.maximum(t - change.clamp(-2, 2), least), most)
         y, error, tangent = _projected(t, start, own, coefficient, M, position)
     tangent = torch.nn.functional.normalize(tangent, dim=-1)
     normal = torch.stack((-tangent[:, 1], tangent[:, 0]), dim=-1)

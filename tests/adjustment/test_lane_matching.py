@@ -329,3 +329,27 @@ def test_without_lanes_or_detections_nothing_is_labelled(lanes: Lanes):
     T = camera_at(0.0)
     assert labels(detections_of([[[8.0, 0, 0], [9, 0, 0]]], T), Builder().lanes([])) == [-1]
     assert labels(detections_of([], T), lanes) == []
+
+
+def test_a_match_slides_to_the_next_control_points_and_no_further(lanes: Lanes):
+    T = camera_at(5.0)
+    x = torch.linspace(20, 40, 15, dtype=torch.float64)
+    rows = observe(pixels_beside(lanes, T, 0 * x, x, 0))
+    count = lanes.control_count
+    coefficient = spline_basis.to_coefficients_flat(lanes.control.point_world, count)
+    nothing, last = torch.zeros(15, 2, dtype=torch.float64), int(count[0]) - 1
+    right = x / 60 * last
+    near = LaneMatches(torch.zeros(15, dtype=torch.int64), right, nothing, x > 0)
+    free = follow(near, rows, T.expand(15, 4, 4), coefficient, count)
+    for ahead in (-1.9, -0.4, 0.4, 1.9):
+        begun = (right + ahead).clamp(0, last)
+        found = follow(
+            replace(near, t=begun), rows, T.expand(15, 4, 4), coefficient, count, begun=begun
+        )
+        assert ((found.t.floor() - begun.floor()).abs() <= 1).all()
+        held = (free.t.floor() - begun.floor()).abs() > 1
+        assert bool(held.any()) == (abs(ahead) > 1)
+        assert torch.allclose(found.t[~held], free.t[~held], atol=1e-3)
+        # What is held is as near to where it should be as it may be, and counts.
+        assert ((found.t - free.t).abs()[held] < (begun - free.t).abs()[held]).all()
+        assert found.valid.all()

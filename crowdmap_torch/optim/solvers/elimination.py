@@ -40,10 +40,6 @@ from crowdmap_torch.optim.solvers.tile_patterns import (
 from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, WindowBuilder
 from crowdmap_torch.processes.threads import in_order
 
-_SLIDES = (-2, -1, 1, 2)
-"""Landmarks that rows may go over to, from where they are: with room for the next one alone, 6 of 280,000 couplings of 25 km
-have none, and the whole order is found anew at every step."""
-
 
 @dataclass(frozen=True)
 class ChainStructure:
@@ -256,7 +252,7 @@ def planned_ahead(
     """The plan with what the rows show of the landmarks, which serves them still when they have changed a little.
 
     Landmarks are ranked such that those coupled to one block are near each other, chains parted by what they see (both
-    worked out on the CPU), and there is room for rows that go over to the next two landmarks, by number, of the `sliding`
+    worked out on the CPU), and there is room for rows that go over to the next landmark, by number, of the `sliding`
     variables.
     """
     _, landmarks, _, keys = _touched(problem, values, plan)
@@ -265,7 +261,7 @@ def planned_ahead(
     for name in sliding:
         first, number = landmarks.first[name], len(values[name])
         at = keys % count - first
-        for step in _SLIDES:
+        for step in (-1, 1):
             goes = (at >= 0) & (at < number) & (at + step >= 0) & (at + step < number)
             room.append(keys[goes] + step)
     return replace(

@@ -11,16 +11,19 @@ and M is a small matrix for every drive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.optim.solvers.block_elimination import Lead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
+from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.processes.threads import in_order
 
 
 @dataclass(frozen=True)
@@ -70,29 +73,37 @@ def joints_of(
     structure: ChainStructure,
     coupling: Mapping[str, Float[Tensor, "f w _"]],
     hessian: TileMatrix,
-    solve: Callable[[Float[Tensor, "e k c"]], Float[Tensor, "e k c"]],
+    leads: Sequence[Sequence[Lead]],
 ) -> Joints | None:
-    """Those of normal equations with B `coupling` and C `hessian`, by a way to `solve` with A; None: there are none."""
+    """Those of equations with B `coupling` and C `hessian`, by what rounds leave behind of A; None: there are none."""
     plan = structure.plan
     if plan.joints is None or plan.joint is None or not len(structure.where.offset[plan.joints]):
         return None
     at = structure.where.entries(plan.joints, slice(None))
     count, width = at.shape
     like = next(iter(coupling.values()))
-    E = like.new_zeros(len(structure.owner), structure.width[plan.chains], 2 * width)
-    first = structure.landmarks.first[plan.joints]
-    for name, block in coupling.items():
-        couples = structure.couplings.factors[name]
-        joint = couples.landmark[:, 0] - first
-        here = torch.nonzero((joint >= 0) & (joint < count))[:, 0]
-        if couples.landmark.shape[1] != 1 or not len(here):
-            continue
-        row = couples.block[here]
-        behind = (plan.joint[structure.owner[row], 1] == joint[here]).long()
-        column = behind[:, None] * width + torch.arange(width, device=row.device)
-        E[row[:, None], :, column] += block[here]
-    U = solve(E)
     chains = len(plan.joint)
+
+    def of_part(
+        of: tuple[Part, Sequence[Lead]],
+    ) -> tuple[Float[Tensor, "n k q"], Float[Tensor, "chains q q"]]:
+        part, own = of
+        E = _towards_joints(structure, part, coupling, width)
+        U = part.solve(own, E)
+        # Few blocks touch a joint.
+        ends = torch.nonzero(E.flatten(1).any(1))[:, 0]
+        taken = like.new_zeros(chains, 2 * width, 2 * width)
+        taken.index_add_(0, structure.owner[part.block[ends]], E[ends].mT @ U[ends])
+        return U, taken
+
+    goes_with = like.new_empty(len(structure.owner), structure.width[plan.chains], 2 * width)
+    taken = like.new_zeros(chains, 2 * width, 2 * width)
+    every = list(zip(structure.parts, leads, strict=True))
+    for (part, _), (U, own) in zip(
+        every, in_order(of_part, every, like.device, worth=1), strict=True
+    ):
+        goes_with[part.block] = U
+        taken += own
     known, joint = plan.joint >= 0, plan.joint.clamp_min(0)
     # Joints that one chain lies between are of one drive.
     follows = torch.zeros(count, dtype=torch.bool, device=at.device)
@@ -109,10 +120,31 @@ def joints_of(
     )
     entry = own[joint].flatten(1)
     of_chain = drive[joint.amax(1)]
-    # Few blocks touch a joint.
-    ends = torch.nonzero(E.flatten(1).any(1))[:, 0]
-    taken = like.new_zeros(chains, 2 * width, 2 * width)
-    taken.index_add_(0, structure.owner[ends], E[ends].mT @ U[ends])
     area = (of_chain[:, None, None] * most * width + entry[:, :, None]) * most * width
     M.view(-1).index_add_(0, (area + entry[:, None]).flatten(), -taken.flatten())
-    return Joints(U, structure.owner, of_chain, entry, torch.linalg.inv(M))
+    return Joints(goes_with, structure.owner, of_chain, entry, torch.linalg.inv(M))
+
+
+def _towards_joints(
+    structure: ChainStructure,
+    part: Part,
+    coupling: Mapping[str, Float[Tensor, "f w _"]],
+    width: int,
+) -> Float[Tensor, "n k q"]:
+    """E of a part's blocks: each with the joint that its chain begins at and the one that it ends at."""
+    plan = structure.plan
+    assert plan.joints is not None and plan.joint is not None
+    like = next(iter(coupling.values()))
+    E = like.new_zeros(len(part.block), structure.width[plan.chains], 2 * width)
+    first, count = structure.landmarks.first[plan.joints], len(structure.where.offset[plan.joints])
+    for name, own in part.factors.items():
+        couples = structure.couplings.factors[name]
+        joint = couples.landmark[own, 0] - first
+        here = torch.nonzero((joint >= 0) & (joint < count))[:, 0]
+        if couples.landmark.shape[1] != 1 or not len(here):
+            continue
+        row = couples.block[own][here]
+        behind = (plan.joint[structure.owner[row], 1] == joint[here]).long()
+        column = behind[:, None] * width + torch.arange(width, device=row.device)
+        E[structure.number[row][:, None], :, column] += coupling[name][own][here]
+    return E

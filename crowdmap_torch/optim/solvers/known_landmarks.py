@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -21,6 +21,9 @@ from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.processes.threads import in_order
+
+_AT_ONCE = 1 << 13
+"""Leaves whose blocks are computed together."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class KnownLandmarks:
             return part.leads(diagonal, link)
 
         leads = tuple(in_order(led, structure.parts, diagonal.device, worth=1))
-        joints = joints_of(structure, coupling, hessian, partial(structure.solve, leads))
+        joints = joints_of(structure, coupling, hessian, leads)
         return cls(structure, diagonal, link, leads, joints)
 
     def of_blocks(self) -> Float[Tensor, "e k k"]:
@@ -71,14 +74,21 @@ class KnownLandmarks:
         """Variance of each leaf's numbers less those of the block that carries it."""
         plan = self.structure.plan
         assert plan.carrier is not None
-        of_carrier = self.of_blocks()[plan.leaf_count :][plan.carrier]
-        alone = torch.linalg.inv(self.diagonal[: plan.leaf_count])
-        # The leaf goes with its carrier by -H^-1 times their link.
-        lags = alone @ self.link[: plan.leaf_count]
-        lags.diagonal(dim1=-2, dim2=-1).add_(1)
-        left = alone + lags @ of_carrier @ lags.mT
         assert plan.leaves is not None
-        return left.diagonal(dim1=-2, dim2=-1)[:, : self.structure.width[plan.leaves]]
+        of_chain, carrier = self.of_blocks()[plan.leaf_count :], plan.carrier
+        width = self.structure.width[plan.leaves]
+
+        def of_some(at: slice) -> Float[Tensor, "m k"]:
+            alone = torch.linalg.inv(self.diagonal[at])
+            # The leaf goes with its carrier by -H^-1 times their link.
+            lags = alone @ self.link[at]
+            lags.diagonal(dim1=-2, dim2=-1).add_(1)
+            left = alone + lags @ of_chain[carrier[at]] @ lags.mT
+            return left.diagonal(dim1=-2, dim2=-1)[:, :width]
+
+        bounds = [*range(0, max(plan.leaf_count, 1), _AT_ONCE), plan.leaf_count]
+        some = [slice(a, b) for a, b in pairwise(bounds)]
+        return torch.cat(list(in_order(of_some, some, of_chain.device)))
 
     def of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
         """Variances of the changes between blocks of chains, leaves marginalised."""
