@@ -27,6 +27,8 @@ CALIBRATIONS: Mapping[str, MapperConfig] = {
 """Configurations that are compared, by what the column `calibration` says of them; `off` is what others are held to."""
 NONE = "none"
 _FACTORS = (1.0, 2.0)
+_COVERED = (0.9, 0.98)
+"""Where the share of sign centres inside their ellipsoids is to lie."""
 _RELATIVE = "map.signs.relative.total.mean"
 _HEADS = "heads.signs.relative.total.mean"
 _LATERAL = "map.lanes.lateral_without_shift.mean"
@@ -93,7 +95,10 @@ def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
         for config in CALIBRATIONS.values()
         for task in _whole_maps(scale, variant, config)
     )
-    return chain(in_short_turns(4, few), in_short_turns(4, straight), in_turns(scale, whole))
+    honest = in_short_turns(4, (_honest_maps(scale),))
+    return chain(
+        in_short_turns(4, few), in_short_turns(4, straight), honest, in_turns(scale, whole)
+    )
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
@@ -132,6 +137,12 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
                 _rows(whole),
                 f"{scale.journeys} drives of {VEHICLES} vehicles over {scale.road.length_m:.0f} m",
             ),
+            Table(
+                "fleet-honest",
+                ("", "found", "asked"),
+                _honest(results(_honest_maps(scale), folder)),
+                f"Whether maps of {few} with all errors know how wrong they are, calibration on",
+            ),
             recovered_table(
                 "fleet-recovered",
                 whole.get((FLEET, "on"), ()),
@@ -142,8 +153,42 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     )
 
 
+def _honest_maps(scale: Scale) -> list[MeasureMap]:
+    """Maps of a few drives with all errors, many seeds."""
+    return _few_maps(scale, FLEET, OURS, seeds=scale.fleet_sets)
+
+
+def _honest(maps: list[Result]) -> tuple[tuple[Cell, ...], ...]:
+    """What covariances are held to, over all sets; sets count by their signs."""
+    signs = numbers(maps, "map.uncertainty.signs")
+    inside, nees = (
+        weighted_mean(numbers(maps, f"map.uncertainty.{name}"), signs)
+        for name in ("coverage", "mean_nees")
+    )
+    low, high = (100 * share for share in _COVERED)
+    return (
+        ("sets", len(maps), ""),
+        (
+            "sign centres inside their 95 % ellipsoid [%]",
+            100 * inside,
+            f"{low:.0f} to {high:.0f} %",
+        ),
+        ("their mean normalised squared error", nees, "3"),
+        (
+            "the shared part's, mean over the sets",
+            weighted_mean(numbers(maps, "map.uncertainty.shared_nees"), [1.0] * len(maps)),
+            "3",
+        ),
+    )
+
+
 def _few_maps(
-    scale: Scale, variant: Variant, config: MapperConfig, *, straight: bool = False
+    scale: Scale,
+    variant: Variant,
+    config: MapperConfig,
+    *,
+    straight: bool = False,
+    seeds: int | None = None,
 ) -> list[MeasureMap]:
     """Maps of a few drives, seed by seed."""
     return [
@@ -152,7 +197,7 @@ def _few_maps(
             scale.fleet_journeys,
             config=config,
         )
-        for seed in range(scale.fleet_seeds)
+        for seed in range(scale.fleet_seeds if seeds is None else seeds)
     ]
 
 

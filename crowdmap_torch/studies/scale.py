@@ -62,6 +62,8 @@ class Scale:
     fleet_vehicles: int = 4
     """That drive them in turn."""
     fleet_seeds: int = 3
+    fleet_sets: int = 20
+    """Seeds of theirs on which it is judged whether maps of drives with all errors know how wrong they are."""
     whole_fleet_seeds: int = 5
     """Seeds at `journeys` that are driven by a fleet with all errors."""
     fleet_errors: int | None = None
@@ -172,6 +174,7 @@ QUICK = Scale(
     fleet_journeys=2,
     fleet_vehicles=2,
     fleet_seeds=1,
+    fleet_sets=2,
     whole_fleet_seeds=1,
     fleet_errors=1,
     fleet_factors=1,

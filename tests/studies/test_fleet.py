@@ -18,6 +18,7 @@ ONE_SEED = Settings(
     replace(
         FULL,
         fleet_seeds=1,
+        fleet_sets=0,
         whole_fleet_seeds=1,
         fleet_errors=2,
         fleet_journeys=2,
@@ -87,6 +88,24 @@ def test_coverage_counts_every_sign_once(tmp_path: Path):
     fill(folder, work(fleet, settings), result)
     table = by_error(fleet.chapter(settings, folder).tables[0])
     assert table["none", 0.0, "off"]["inside 95 % [%]"] == pytest.approx(90.0)
+
+
+def test_whether_fleets_know_how_wrong_they_are_is_asked_of_many_sets(tmp_path: Path):
+    settings = Settings(replace(ONE_SEED.scale, fleet_errors=0, fleet_sets=4), None)
+    folder = StudyFolder(tmp_path)
+
+    def result(task):
+        of_map, seed = figures(0.1, 0.2), task.simulation.seed
+        told = {"signs": 10, "coverage": 0.8 + 0.04 * seed, "mean_nees": 3.0, "shared_nees": seed}
+        of_map["uncertainty"] |= told
+        return measured() | {"map": of_map, "clean": {"lane_width": errors(0.1)}}
+
+    fill(folder, work(fleet, settings), result)
+    (table,) = (t for t in fleet.chapter(settings, folder).tables if t.name == "fleet-honest")
+    found = {title: value for title, value, _ in rows(table)}
+    assert found["sets"] == 4
+    assert found["sign centres inside their 95 % ellipsoid [%]"] == pytest.approx(86.0)
+    assert found["the shared part's, mean over the sets"] == pytest.approx(1.5)
 
 
 def test_a_second_configuration_has_rows_and_work_of_its_own(

@@ -32,6 +32,7 @@ def test_the_quick_scale_is_smaller_in_everything():
         "honest_sets",
         "noise_steps",
         "fleet_seeds",
+        "fleet_sets",
         "whole_fleet_seeds",
         "fleet_factors",
     ):
