@@ -100,6 +100,12 @@ def test_the_list_of_subcommands_loads_none_of_them():
     assert "torch._C" not in ended.stderr and "numpy" not in ended.stderr
 
 
+def test_what_only_the_papers_clustering_needs_is_not_loaded_before_it():
+    code = "import sys, crowdmap_torch.mapper; print(*(m for m in sys.modules if m in LATE))"
+    late = {"sklearn", "scipy.stats"}
+    assert python("-c", code.replace("LATE", repr(late))).stdout.split() == []
+
+
 def test_threads_are_told_to_sleep_before_torch_is_loaded():
     code = (
         "import os, sys, importlib.abc\n"

@@ -14,7 +14,6 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from sklearn.cluster import KMeans
 from torch import Tensor
 
 from crowdmap_torch.clustering.eigenpairs import leading_eigenpairs
@@ -120,6 +119,9 @@ def kmeans_labels(
 
 def _kmeans(rows: np.ndarray, **options: Any) -> tuple[np.ndarray, float]:
     """Labels, and the sum of squared distances to the clusters' means."""
+    # A third of a second, which every process would wait for; only the paper's clustering needs it.
+    from sklearn.cluster import KMeans
+
     found = KMeans(**options).fit(rows)
     return np.asarray(found.labels_), float(np.asarray(found.inertia_))
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.stats import chi2
+from scipy.special import chdtri
 from torch import Tensor
 
 from crowdmap_torch.optim.linearize import chunks, row_blocks
@@ -37,8 +37,8 @@ class Innovations:
         """
         kinds = self.freedom.unique()
         median, bound = self.squared.new_zeros(2, int(kinds.max()) + 1 if len(kinds) else 1)
-        median[kinds] = median.new_tensor(chi2.median(kinds.cpu().numpy()))
-        bound[kinds] = bound.new_tensor(chi2.isf(probability, kinds.cpu().numpy()))
+        median[kinds] = median.new_tensor(chdtri(kinds.cpu().numpy(), 0.5))
+        bound[kinds] = bound.new_tensor(chdtri(kinds.cpu().numpy(), probability))
         usual = (self.squared / median[self.freedom])[self.weight > 0]
         scale = usual.median().clamp_min(1.0) if len(usual) else median.new_tensor(1.0)
         return self.squared > scale * bound[self.freedom]
