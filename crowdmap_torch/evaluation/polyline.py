@@ -166,6 +166,6 @@ def nearest(found: Crossings, offset_m: Tensor | None = None) -> Crossings:
 
 
 def _nearest_of_each_line(found: Crossings, offset: Tensor) -> Crossings:
-    pair = torch.stack((found.point, found.line), dim=1)
-    _, group = pair.unique(dim=0, return_inverse=True)
+    lines = int(found.line.max()) + 1 if len(found.line) else 1
+    _, group = (found.point * lines + found.line).unique(return_inverse=True)
     return found[group_argmin((found.lateral - offset[found.point]).abs(), group)]

@@ -26,7 +26,9 @@ def landmark_pairs(
             continue
         blocks = [at + landmarks.first[name] for name, at in term.slots if name in landmarks.first]
         found += [torch.stack(pair, dim=1) for pair in _pairs(blocks)]
-    return torch.unique(torch.cat(found), dim=0)
+    first, second = torch.cat(found).unbind(1)
+    key = torch.unique(first * landmarks.count + second)
+    return torch.stack((key // landmarks.count, key % landmarks.count), dim=1)
 
 
 def direct_pattern(
