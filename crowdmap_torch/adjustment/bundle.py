@@ -24,7 +24,7 @@ from crowdmap_torch.adjustment.shared_corner_errors import (
     lasting_variance,
     shared_errors,
 )
-from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry import se3, spline_basis
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, white_scales
 from crowdmap_torch.noise.pose_prior import CUT_TERMS
 from crowdmap_torch.optim.innovation_gate import innovations
@@ -187,7 +187,8 @@ class Bundle(nn.Module):
         )
         values = self.values()
         problem = Problem(self.variables, {**seen, **self._slide_term()})
-        return planned_ahead(problem, values, plan, sliding=("lane",))
+        lane, _ = spline_basis.rows(self.lane_count)
+        return planned_ahead(problem, values, plan, sliding={"lane": lane})
 
     @property
     def matches(self) -> LaneMatches:

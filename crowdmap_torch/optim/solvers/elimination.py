@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -36,9 +35,13 @@ from crowdmap_torch.optim.solvers.tile_patterns import (
     direct_pattern,
     landmark_pairs,
     reduced_pattern,
+    tiles_of_factor,
 )
 from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, WindowBuilder
 from crowdmap_torch.processes.threads import in_order
+
+_SPARSER = 0.8
+"""Share of the tiles of an order by dissection that a band is to have less than, if it is taken."""
 
 
 @dataclass(frozen=True)
@@ -247,27 +250,34 @@ def _beside_each_other(keys: Int[Tensor, " keys"], owner: Int[Tensor, " e"], cou
 
 
 def planned_ahead(
-    problem: Problem, values: Values, plan: EliminationPlan, *, sliding: Collection[str] = ()
+    problem: Problem,
+    values: Values,
+    plan: EliminationPlan,
+    *,
+    sliding: Mapping[str, Int[Tensor, " n"]] | None = None,
 ) -> EliminationPlan:
     """The plan with what the rows show of the landmarks, which serves them still when they have changed a little.
 
     Landmarks are ranked such that those coupled to one block are near each other, chains parted by what they see (both
     worked out on the CPU), and there is room for rows that go over to the next landmark, by number, of the `sliding`
-    variables.
+    variables: along a row of landmarks, of which each block's number is given, and not from one row to another.
     """
     _, landmarks, _, keys = _touched(problem, values, plan)
     pairs = landmark_pairs(problem, landmarks, plan.first_block)
     room, count = [keys], landmarks.count
-    for name in sliding:
-        first, number = landmarks.first[name], len(values[name])
-        at = keys % count - first
+    for name, of in (sliding or {}).items():
+        at = keys % count - landmarks.first[name]
+        own = torch.nonzero((at >= 0) & (at < len(of)))[:, 0]
         for step in (-1, 1):
-            goes = (at >= 0) & (at < number) & (at + step >= 0) & (at + step < number)
-            room.append(keys[goes] + step)
+            here, there = at[own], at[own] + step
+            goes = (there >= 0) & (there < len(of))
+            goes &= of[there.clamp(0, len(of) - 1)] == of[here]
+            room.append(keys[own[goes]] + step)
+    every = torch.unique(torch.cat(room))
     return replace(
         plan,
-        rank=_rank(keys, pairs, plan.owner, landmarks),
-        room=torch.unique(torch.cat(room)),
+        rank=_rank(every, pairs, plan.owner, landmarks),
+        room=every,
         part=parts_of_chains(keys, plan, count),
     )
 
@@ -294,15 +304,25 @@ def _rank(
 ) -> Float[Tensor, " q"]:
     """A position of every landmark on a line, by couplings as keys and pairs that are bound without an eliminated block."""
     count = landmarks.count
-    block, column = keys // count, (keys % count).cpu().numpy()
+    block, landmark = keys // count, torch.cat((keys % count, pairs.flatten()))
     # Blocks of a chain are coupled to nearly what their neighbours are: a few of them together tell the same.
-    position = near_each_other(incidence((block // 8).cpu().numpy(), column, count))
+    by_few = incidence((block // 8).cpu().numpy(), (keys % count).cpu().numpy(), count)
+    if not len(landmarks.width):
+        return torch.zeros(count, dtype=torch.double, device=keys.device)
     # Once it is eliminated, a chain has bound all that it was coupled to.
     first = int(owner.max()) + 1 if len(owner) else 0
-    apart = torch.arange(first, first + len(pairs)).repeat_interleave(2)
-    row = torch.cat((owner[block].cpu(), apart)).numpy()
-    bound = incidence(row, np.concatenate((column, pairs.flatten().cpu().numpy())), count)
-    width = landmarks.width.cpu().numpy()
-    if not len(width):
-        return torch.zeros(count, dtype=torch.double, device=keys.device)
-    return torch.from_numpy(dissected(bound, width, position)).double().to(keys.device)
+    apart = torch.arange(first, first + len(pairs), device=keys.device).repeat_interleave(2)
+    by = torch.cat((owner[block], apart))
+    bound = incidence(by.cpu().numpy(), landmark.cpu().numpy(), count)
+    # In a city by dissection; along one road a band may be sparser, though its windows have more runs.
+    nested, banded = (
+        torch.from_numpy(found).to(keys.device)
+        for found in (
+            dissected(bound, landmarks.width.cpu().numpy(), near_each_other(by_few)),
+            near_each_other(bound),
+        )
+    )
+    of_nested, of_banded = (
+        tiles_of_factor(by, landmark, landmarks, position) for position in (nested, banded)
+    )
+    return (banded if of_banded < _SPARSER * of_nested else nested).double()

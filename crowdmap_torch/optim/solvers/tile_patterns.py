@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -65,6 +66,21 @@ def reduced_pattern(
     present = _bound(group, landmarks.ordered[place], landmarks, direct.width)
     present |= direct.present.cpu().numpy()
     return TilePattern.of(direct.dim, direct.width, present, direct.own.device).filled()
+
+
+def tiles_of_factor(
+    by: Int[Tensor, " n"],
+    landmark: Int[Tensor, " n"],
+    landmarks: LandmarkBlocks,
+    position: Int[Tensor, " q"],
+) -> int:
+    """How many tiles the factor has where landmarks have these positions, each bound to all that are bound `by` the same."""
+    order = torch.argsort(position)
+    column = torch.empty_like(order)
+    column[order] = landmarks.width[order].cumsum(0) - landmarks.width[order]
+    placed, width = replace(landmarks, column=column), tile_width(landmarks.dim, column.device)
+    present = _bound(by, landmark, placed, width)
+    return TilePattern.of(landmarks.dim, width, present, column.device).filled().count
 
 
 def _pairs(blocks: list[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:

@@ -297,7 +297,12 @@ def moved_on(built: Problem, by: int) -> Problem:
 @pytest.mark.parametrize(("by", "keeps"), [(1, True), (4, False)])
 def test_the_order_is_kept_while_rows_go_no_further_than_there_is_room(by: int, keeps: bool):
     built, values, chain = problem([10, 1, 9, 8])
-    plan = planned_ahead(built, values, EliminationPlan("pose", chain), sliding=("mark",))
+    plan = planned_ahead(
+        built,
+        values,
+        EliminationPlan("pose", chain),
+        sliding={"mark": torch.zeros(9, dtype=torch.long)},
+    )
     damping = torch.tensor([1e-3], dtype=torch.float64)
     backend = ChainBackend(plan)
     before, _ = backend.prepare(built, values)
@@ -315,6 +320,24 @@ def test_the_order_is_kept_while_rows_go_no_further_than_there_is_room(by: int, 
     back = backend.assemble(built, values).solve(damping)
     first = ChainBackend(plan).assemble(built, values).solve(damping)
     assert all(torch.equal(back.delta[name], first.delta[name]) for name in values)
+
+
+def test_there_is_room_along_a_row_of_landmarks_and_none_for_the_next_row():
+    built, values, chain = problem([10, 1, 9, 8])
+    plan, count = EliminationPlan("pose", chain), len(values["mark"])
+    _, mark = (block for _, block in built.terms["sighting"].slots)
+    assert {2, 3} <= set(mark.tolist()) and count == 9
+    none = planned_ahead(built, values, plan).room
+    row = torch.tensor([0, 0, 0, 1, 1, 1, 1, 1, 1])
+    room = planned_ahead(built, values, plan, sliding={"mark": row}).room
+    assert none is not None and room is not None
+    expected = {
+        (pose, beside)
+        for pose, own in ((key // count, key % count) for key in none.tolist())
+        for beside in (own - 1, own, own + 1)
+        if 0 <= beside < count and row[beside] == row[own]
+    }
+    assert {(key // count, key % count) for key in room.tolist()} == expected
 
 
 def on_drift(

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
+from crowdmap_torch.optim.problem import Problem, Variable, euclidean
 from crowdmap_torch.optim.solvers.dissection import dissected, incidence, near_each_other
+from crowdmap_torch.optim.solvers.layout import layout
+from crowdmap_torch.optim.solvers.tile_patterns import tiles_of_factor
+from crowdmap_torch.optim.solvers.windows import LandmarkBlocks
 
 
 def road(cells, each=30, over=3):
@@ -85,3 +90,28 @@ def test_roads_apart_from_each_other_are_ordered_one_by_one():
     found = dissected(bound, np.full(2 * count, 8), near_each_other(bound))
     first, second = found[:count], found[count:]
     assert first.max() < second.min() or second.max() < first.min()
+
+
+@pytest.mark.parametrize("world", [road, grid])
+def test_tiles_of_a_factor_are_those_that_elimination_fills(world):
+    bound, count = world(12)
+    each = 24
+    by, landmark = (torch.from_numpy(x).long() for x in bound.nonzero())
+    variables = {"mark": Variable(each, euclidean)}
+    where = layout(Problem(variables, {}), {"mark": torch.zeros(count, each)})
+    blocks = LandmarkBlocks.of(where, torch.device("cpu"))
+    line = near_each_other(bound)
+    for found in (line, dissected(bound, np.full(count, each), line)):
+        tiles = tiles_of_factor(by, landmark, blocks, torch.from_numpy(found))
+        # Tiles of 160 columns hold up to eight landmarks of 24.
+        order = np.argsort(found)
+        tile = np.arange(count) * each // 160, ((np.arange(count) + 1) * each - 1) // 160
+        holds = np.zeros((bound.shape[0], tile[1].max() + 1), dtype=bool)
+        dense = bound.toarray()[:, order] > 0
+        for at in tile:
+            for k, t in enumerate(at):
+                holds[:, t] |= dense[:, k]
+        expected = fill(
+            bound_by([np.nonzero(r)[0] for r in holds], holds.shape[1]), np.arange(holds.shape[1])
+        )
+        assert tiles == expected
