@@ -15,7 +15,8 @@ from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import columns
 from crowdmap_torch.evaluation.evaluate import Against, progress_scalars
 from crowdmap_torch.optim.levenberg_marquardt import LmState
-from crowdmap_torch.optim.linearize import residuals, term_costs
+from crowdmap_torch.optim.linearize import residuals
+from crowdmap_torch.optim.robust import Loss
 from crowdmap_torch.report import plots
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.tensorboard import TensorBoardLog
@@ -77,7 +78,7 @@ class Watch:
         self.residual_px["cluster heads"] = corner_residuals(bundle).norm(dim=-1)
         errors = self._errors(bundle, with_lanes=True)
         self._log.log_scalars(errors, 0)
-        self._cost = _cost(bundle)
+        self._cost = _cost(_squares(bundle))
         return Residuals(self.residual_px, self._cost)
 
     @property
@@ -95,7 +96,8 @@ class Watch:
     def step(self, number: int, state: LmState, bundle: Bundle) -> None:
         """One step of the solver."""
         looked_at = number % self._every == 0
-        before, self._cost = self._cost, _cost(bundle)
+        squares = _squares(bundle)
+        before, self._cost = self._cost, _cost(squares)
         iteration = Iteration(
             number=number + 1,
             cost={name: float(cost) for name, cost in state.term_cost.items()},
@@ -113,11 +115,9 @@ class Watch:
         if not looked_at:
             self._log.log_iteration(iteration)
             return
-        values = bundle.values()
         down_weighted = {}
-        for name, term in bundle.problem().terms.items():
-            squared = residuals(term, values).square().sum(-1)
-            weight = term.loss.weight(squared)
+        for name, (squared, loss) in squares.items():
+            weight = loss.weight(squared)
             down_weighted[name] = float((weight < 0.5).to(weight).mean()) if len(weight) else 0.0
             self._log.log_histogram(f"residual/{name}", squared.sqrt(), number + 1)
             self._log.log_histogram(f"weight/{name}", weight, number + 1)
@@ -155,9 +155,22 @@ class Watch:
         )
 
 
-def _cost(bundle: Bundle) -> float:
-    """Of all terms, where the bundle is and in its scales."""
-    return sum(float(cost) for cost in term_costs(bundle.problem(), bundle.values()).values())
+_Squares = dict[str, tuple[Float[Tensor, " m"], Loss]]
+"""By term, every row's squared residual in units of its sigma, and what the rows lose by them."""
+
+
+def _squares(bundle: Bundle) -> _Squares:
+    """Where the bundle is and in its scales."""
+    problem, values = bundle.problem(), bundle.values()
+    return {
+        name: (residuals(term, values).square().sum(-1), term.loss)
+        for name, term in problem.terms.items()
+    }
+
+
+def _cost(squares: _Squares) -> float:
+    """Of all terms."""
+    return sum(float(loss.rho(squared).sum() / 2) for squared, loss in squares.values())
 
 
 def _scales(bundle: Bundle) -> dict[str, float]:

@@ -166,6 +166,11 @@ def _honest(maps: list[Result]) -> tuple[tuple[Cell, ...], ...]:
         for name in ("coverage", "mean_nees")
     )
     low, high = (100 * share for share in _COVERED)
+    shared = {
+        "the shared part's, mean over the sets": "map.uncertainty.shared_nees",
+        "the same of the draw: mean pose errors against their true sigmas": "shared.drawn_nees",
+        "the shared part's, in the mean over all draws by those sigmas": "shared.expected_nees",
+    }
     return (
         ("sets", len(maps), ""),
         (
@@ -174,10 +179,9 @@ def _honest(maps: list[Result]) -> tuple[tuple[Cell, ...], ...]:
             f"{low:.0f} to {high:.0f} %",
         ),
         ("their mean normalised squared error", nees, "3"),
-        (
-            "the shared part's, mean over the sets",
-            weighted_mean(numbers(maps, "map.uncertainty.shared_nees"), [1.0] * len(maps)),
-            "3",
+        *(
+            (title, weighted_mean(numbers(maps, path), [1.0] * len(maps)), "3")
+            for title, path in shared.items()
         ),
     )
 
