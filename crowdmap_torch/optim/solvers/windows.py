@@ -297,7 +297,7 @@ class WindowBuilder:
         has = (receiver < self.n)[:, :, None, :]
         good = has & (is_gradient | (found & known[:, None, :, None]))
         # Half the memory of what is kept of an order; there are fewer than 2^31 rows.
-        return torch.where(good, row, self.store_rows).int()
+        return torch.where(good, row, self.store_rows)
 
     def rows(self, block: Tensor, landmark: Tensor, widths: Sequence[int]) -> Tensor:
         """Store rows of factors' columns, one behind the other; the landmarks have these widths."""
