@@ -296,7 +296,6 @@ class WindowBuilder:
         row = self.first_row[receiver][:, :, None, :] + torch.where(is_gradient, 0, place + rest)
         has = (receiver < self.n)[:, :, None, :]
         good = has & (is_gradient | (found & known[:, None, :, None]))
-        # Half the memory of what is kept of an order; there are fewer than 2^31 rows.
         return torch.where(good, row, self.store_rows)
 
     def rows(self, block: Tensor, landmark: Tensor, widths: Sequence[int]) -> Tensor:
