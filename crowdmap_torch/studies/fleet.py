@@ -13,6 +13,7 @@ from crowdmap_torch.simulate.errors import ALL, ERRORS, VEHICLES, with_errors
 from crowdmap_torch.studies.chapter import Cell, Chapter, Table
 from crowdmap_torch.studies.curves import plot_bars
 from crowdmap_torch.studies.folder import StudyFolder
+from crowdmap_torch.studies.honesty import over_all_sets, values_of
 from crowdmap_torch.studies.maps import OURS, in_short_turns, in_turns, our_maps
 from crowdmap_torch.studies.numbers import Result, numbers, results, spread_of, weighted_mean
 from crowdmap_torch.studies.recovered import recovered_table
@@ -159,31 +160,8 @@ def _honest_maps(scale: Scale) -> list[MeasureMap]:
 
 
 def _honest(maps: list[Result]) -> tuple[tuple[Cell, ...], ...]:
-    """What covariances are held to, over all sets; sets count by their signs."""
-    signs = numbers(maps, "map.uncertainty.signs")
-    inside, nees = (
-        weighted_mean(numbers(maps, f"map.uncertainty.{name}"), signs)
-        for name in ("coverage", "mean_nees")
-    )
-    low, high = (100 * share for share in _COVERED)
-    shared = {
-        "the shared part's, mean over the sets": "map.uncertainty.shared_nees",
-        "the same of the draw: mean pose errors against their true sigmas": "shared.drawn_nees",
-        "the shared part's, in the mean over all draws by those sigmas": "shared.expected_nees",
-    }
-    return (
-        ("sets", len(maps), ""),
-        (
-            "sign centres inside their 95 % ellipsoid [%]",
-            100 * inside,
-            f"{low:.0f} to {high:.0f} %",
-        ),
-        ("their mean normalised squared error", nees, "3"),
-        *(
-            (title, weighted_mean(numbers(maps, path), [1.0] * len(maps)), "3")
-            for title, path in shared.items()
-        ),
-    )
+    """What covariances are held to, over all sets."""
+    return (("sets", len(maps), ""), *over_all_sets(values_of(maps), _COVERED))
 
 
 def _few_maps(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from scipy.stats import chi2
 
@@ -11,7 +11,7 @@ from crowdmap_torch.studies.chapter import Cell, Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, plot_lines
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.maps import honest_maps
-from crowdmap_torch.studies.numbers import numbers, results, weighted_mean
+from crowdmap_torch.studies.numbers import Result, numbers, results, weighted_mean
 from crowdmap_torch.studies.scale import SHORT_TURNS
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import Task
@@ -53,10 +53,7 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """Coverage over all data sets, and the shared part's normalised squared error."""
     scale = settings.scale
     found = results(honest_maps(scale, scale.honest_sets), folder)
-    values = {
-        name: [(100 if name in _PERCENT else 1) * value for value in numbers(found, path)]
-        for name, path in _NUMBERS.items()
-    }
+    values = values_of(found)
     return Chapter(
         text=(
             f"{len(found)} data sets of {scale.honest_journeys} journeys on {scale.short_road.length_m:.0f} m of road. "
@@ -68,18 +65,28 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             "of the shared part beside those sigmas, whatever was drawn.",
         ),
         tables=(
-            Table("honesty", ("", "found", "asked"), _over_all_sets(values)),
+            Table("honesty", ("", "found", "asked"), over_all_sets(values)),
             Table("honesty-sets", _COLUMNS, _set_by_set(values)),
         ),
         plots={"honesty": plot_lines(_panels(values), x="seed", y="")},
     )
 
 
-def _over_all_sets(values: Values) -> tuple[tuple[Cell, ...], ...]:
+def values_of(found: Sequence[Result]) -> Values:
+    """What covariances are judged by, of each data set."""
+    return {
+        name: [(100 if name in _PERCENT else 1) * value for value in numbers(found, path)]
+        for name, path in _NUMBERS.items()
+    }
+
+
+def over_all_sets(
+    values: Values, covered: tuple[float, float] = COVERED
+) -> tuple[tuple[Cell, ...], ...]:
     """What is judged, what was found of it in the mean over all data sets, and what is asked."""
     sets = len(values["signs"])
     low, high = chi2.ppf((0.025, 0.975), _CENTER_FREEDOM * sets) / sets if sets else 2 * (math.nan,)
-    asked = f"{100 * COVERED[0]:.0f} to {100 * COVERED[1]:.0f} %"
+    asked = f"{100 * covered[0]:.0f} to {100 * covered[1]:.0f} %"
     signs, metres, alike = values["signs"], values["length"], [1.0] * sets
     judged = (
         ("sign centres inside their 95 % ellipsoid [%]", "coverage", signs, asked),

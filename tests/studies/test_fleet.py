@@ -105,7 +105,7 @@ def test_whether_fleets_know_how_wrong_they_are_is_asked_of_many_sets(tmp_path: 
     found = {title: value for title, value, _ in rows(table)}
     assert found["sets"] == 4
     assert found["sign centres inside their 95 % ellipsoid [%]"] == pytest.approx(86.0)
-    assert found["the shared part's, mean over the sets"] == pytest.approx(1.5)
+    assert found["the shared part's, mean over the data sets"] == pytest.approx(1.5)
 
 
 def test_a_second_configuration_has_rows_and_work_of_its_own(

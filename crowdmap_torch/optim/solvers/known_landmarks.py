@@ -73,8 +73,7 @@ class KnownLandmarks:
     def of_leaves(self) -> Float[Tensor, "l k"]:
         """Variance of each leaf's numbers less those of the block that carries it."""
         plan = self.structure.plan
-        assert plan.carrier is not None
-        assert plan.leaves is not None
+        assert plan.carrier is not None and plan.leaves is not None
         of_chain, carrier = self.of_blocks()[plan.leaf_count :], plan.carrier
         width = self.structure.width[plan.leaves]
 

@@ -183,7 +183,7 @@ class MapEquations(NormalEquations, Protocol):
         ...
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
-        """Variances of changes along chains landmarks and border known."""
+        """Variances of changes along chains, landmarks and border known."""
         ...
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
