@@ -34,12 +34,15 @@ from crowdmap_torch.simulate.rigs import RigConfig
 from crowdmap_torch.simulate.roads import RoadShape
 from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
 from crowdmap_torch.simulate.signposts import SignConfig
+from crowdmap_torch.simulate.street_grid import CityConfig
 from crowdmap_torch.simulate.vehicle import VehicleConfig
-from crowdmap_torch.simulate.worlds import WORLD_PRESETS, World, WorldConfig
+from crowdmap_torch.simulate.worlds import CITY, WORLD_PRESETS, World, WorldConfig
 
+_WORLDS = {**WORLD_PRESETS, CITY.name: CITY}
 _GROUPS = {
     "world": WorldConfig,
     "road": RoadShape,
+    "city": CityConfig,
     "roadside": SignConfig,
     "vehicle": VehicleConfig,
     "rig": RigConfig,
@@ -53,7 +56,7 @@ _GROUPS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap simulate` takes."""
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the dataset")
-    parser.add_argument("--world", choices=sorted(WORLD_PRESETS), default="suburb")
+    parser.add_argument("--world", choices=sorted(_WORLDS), default="suburb")
     parser.add_argument(
         "--map",
         type=Path,
@@ -144,7 +147,7 @@ def _configuration(options: argparse.Namespace) -> SimulationConfig:
     """The presets, with the errors that are asked for and all that options say of single numbers."""
     signs, lanes = DETECTION_PRESETS[options.detection]
     config = SimulationConfig(
-        world=WORLD_PRESETS[options.world],
+        world=_WORLDS[options.world],
         positioning=POSITIONING_PRESETS[options.positioning],
         signs=signs,
         lanes=lanes,
@@ -164,6 +167,7 @@ def _configuration(options: argparse.Namespace) -> SimulationConfig:
             options,
             "world",
             road=_changed(world.road, options, "road"),
+            city=_changed(world.city, options, "city"),
             signs=_changed(world.signs, options, "roadside"),
         ),
         **{name: _changed(getattr(config, name), options, name) for name in sections},

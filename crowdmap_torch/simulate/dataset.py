@@ -31,9 +31,9 @@ from crowdmap_torch.simulate.rigs import RigConfig, SimulatedRig, build_rig
 from crowdmap_torch.simulate.sign_detections import SignDetectionConfig, SignRows
 from crowdmap_torch.simulate.sign_perception import detect_signs
 from crowdmap_torch.simulate.vehicle import Drive, VehicleConfig, drive_through
-from crowdmap_torch.simulate.worlds import WORLD_PRESETS, World, WorldConfig, build_world
+from crowdmap_torch.simulate.worlds import WORLD_PRESETS, World, WorldConfig, build_world, on_route
 
-_WORLD, _RIG, _JOURNEY, _FAULTS, _VEHICLE, _DETECTOR, _DRIVE = range(7)
+_WORLD, _RIG, _JOURNEY, _FAULTS, _VEHICLE, _DETECTOR, _DRIVE, _ROUTE = range(8)
 """Streams of random numbers: what one of them draws does not depend on how much the others did."""
 _FIRST_START = datetime(2026, 5, 1, 8, 0, tzinfo=UTC)
 DETECTION_PRESETS = {
@@ -162,6 +162,7 @@ def make_journey(
             sign_rng,
             frame_rate_hz=rate,
             errors=vehicle.errors,
+            streets=world.streets,
         ),
         lanes=detect_lanes(
             world,
@@ -193,7 +194,10 @@ def _drive(
             own[index % len(own)], vehicle.rig, rig, world.road, config.vehicle, rng
         )
     else:
-        drive = drive_through(world, rig, config.vehicle, rng, direction=direction)
+        route_rng = np.random.default_rng([config.seed, _ROUTE, index])
+        changes = config.vehicle.lane_changes_per_km
+        way = on_route(world, route_rng, changes_per_km=changes)
+        drive = drive_through(way, rig, config.vehicle, rng, direction=direction)
     if not world.is_map:
         return drive
     ahead = drive.R_world_camera[:, :, 2]

@@ -23,6 +23,7 @@ from crowdmap_torch.ranges import (
 from crowdmap_torch.simulate.fleet import NO_ERRORS, VehicleErrors
 from crowdmap_torch.simulate.markers import Markers
 from crowdmap_torch.simulate.motion import Shutter
+from crowdmap_torch.simulate.sight import Sight, sight
 from crowdmap_torch.simulate.vehicle import Drive
 from crowdmap_torch.simulate.worlds import World
 
@@ -111,6 +112,9 @@ def detect_lanes(
 ) -> LaneRows:
     """All lane detections of a drive, frame after frame; `camera` is the true one."""
     is_hidden = _is_hidden(drive, config, rng, frame_rate_hz)
+    if world.streets is not None:
+        p, R = drive.p_world_camera, drive.R_world_camera
+        drive = replace(drive, passing=sight(world.markers, p, R, far_m=config.lane_far_m[1]))
     shutter = Shutter(drive, camera, errors.read_out_s)
     parts = []
     for first in range(0, len(drive), _CHUNK_FRAMES):
@@ -180,6 +184,8 @@ def _nearest_markers(
     world: World, drive: Drive, config: LaneDetectionConfig, frames: Int[np.ndarray, " f"]
 ) -> tuple[Int[np.ndarray, " d"], Int[np.ndarray, " d"]]:
     """The markers that each frame sees: those that pass nearest beside the camera."""
+    if isinstance(drive.passing, Sight):
+        return drive.passing.nearest(frames, config.max_lanes, config.lane_side_m)
     markers = world.markers
     frame = np.repeat(frames, len(markers))
     marker = np.tile(np.arange(len(markers)), len(frames))
@@ -210,9 +216,11 @@ def _parameters(
     """Parameters on markers: `ahead` of the vehicle, or `share` of those across the road."""
     markers = world.markers
     if drive.passing is not None:
-        foot = drive.passing.foot[frame[:, None], marker]
-        along = foot + drive.passing.sense[frame[:, None], marker] * ahead
-        return np.where(np.isnan(along), share * markers.length()[marker], along)
+        frames = np.broadcast_to(frame[:, None], marker.shape)
+        foot, sense = drive.passing.place(frames, marker)
+        low, high = drive.passing.window(frames, marker)
+        along = foot + sense * ahead
+        return np.where(np.isnan(along), low + share * (high - low), along)
     station = drive.station[frame, None] + drive.direction * ahead
     if world.road.closed:
         station = world.road.wrap(station)
@@ -284,13 +292,14 @@ def _leftwards(
         runs_across = np.isnan(station)
         left = world.road.leftwards(np.where(runs_across, 0.0, station)) * drive.direction
     else:
-        runs_across = np.isnan(drive.passing.foot[frame[:, None], marker])
+        foot, sense = drive.passing.place(np.broadcast_to(frame[:, None], marker.shape), marker)
+        runs_across = np.isnan(foot)
         before, after = (
             np.maximum(parameter - 0.5, 0),
             np.minimum(parameter + 0.5, markers.length()[marker]),
         )
         onward = markers.at(marker, after) - markers.at(marker, before)
-        onward = onward * drive.passing.sense[frame[:, None], marker][..., None]
+        onward = onward * sense[..., None]
         left = np.stack((-onward[..., 1], onward[..., 0], np.zeros(marker.shape)), axis=-1)
         left = left / np.maximum(np.linalg.norm(left, axis=-1, keepdims=True), 1e-12)
     return np.where(runs_across[..., None], 0.0, left)

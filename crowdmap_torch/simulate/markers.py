@@ -107,3 +107,19 @@ def lay_markers(road: Road, strips: Sequence[Strip], *, dash_m: float, gap_m: fl
         is_oncoming=np.array([strip.is_oncoming for strip in strips], dtype=bool),
         point=np.concatenate(points) if points else np.zeros((0, 3)),
     )
+
+
+def join_markers(parts: Sequence[Markers]) -> Markers:
+    """The markers of many roads, numbered anew."""
+    count = np.concatenate([part.count for part in parts])
+    return Markers(
+        lane_id=tuple(f"lane-{k:03d}" for k in range(len(count))),
+        type=tuple(kind for part in parts for kind in part.type),
+        start=np.cumsum(count) - count,
+        count=count,
+        station=np.concatenate([part.station for part in parts]),
+        dash_m=np.concatenate([part.dash_m for part in parts]),
+        gap_m=np.concatenate([part.gap_m for part in parts]),
+        is_oncoming=np.concatenate([part.is_oncoming for part in parts]),
+        point=np.concatenate([part.point for part in parts]),
+    )

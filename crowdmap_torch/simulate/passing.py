@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from crowdmap_torch.simulate.markers import STEP_M, Markers
@@ -22,6 +22,20 @@ class Passing:
     """Parameter of the marker's point beside the camera, beyond its ends straight on; NaN where it runs across [m]."""
     sense: Float[np.ndarray, "f m"]
     """1 where the car drives as the marker's points run, -1 against them."""
+    length: Float[np.ndarray, " m"]
+    """Of the markers' parameters [m]."""
+
+    def place(
+        self, frame: Int[np.ndarray, "*batch"], marker: Int[np.ndarray, "*batch"]
+    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+        """Foot and sense."""
+        return self.foot[frame, marker], self.sense[frame, marker]
+
+    def window(
+        self, frame: Int[np.ndarray, "*batch"], marker: Int[np.ndarray, "*batch"]
+    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+        """First and last parameter of what may be in sight: the whole marker."""
+        return np.zeros(marker.shape), self.length[marker]
 
 
 def passing(
@@ -40,4 +54,4 @@ def passing(
         along = np.sum(tangent[near] * ahead, axis=1)
         feet.append(np.where(np.abs(along) > _MIN_ALONG, near * STEP_M + beyond, np.nan))
         senses.append(np.sign(along))
-    return Passing(np.stack(feet, axis=1), np.stack(senses, axis=1))
+    return Passing(np.stack(feet, axis=1), np.stack(senses, axis=1), markers.length())

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 
 from crowdmap_torch.geometry import polygon
-from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.geometry.camera import MAX_OFF_AXIS, Camera, unproject
 from crowdmap_torch.simulate.fleet import NO_ERRORS, VehicleErrors
 from crowdmap_torch.simulate.motion import Shutter
 from crowdmap_torch.simulate.sign_detections import (
@@ -20,10 +21,11 @@ from crowdmap_torch.simulate.sign_detections import (
 )
 from crowdmap_torch.simulate.sign_faults import ghosts, with_outliers, with_wrong_shapes
 from crowdmap_torch.simulate.signposts import WorldSigns
+from crowdmap_torch.simulate.street_grid import StreetGrid
 from crowdmap_torch.simulate.vehicle import Drive
 
 _CORNERS = polygon.CORNER_COUNT.numpy()
-_CHUNK_FRAMES = 4000
+_CHUNK_FRAMES = 1000
 """Frames looked at in one go; bounds the memory of endless drives."""
 
 
@@ -36,11 +38,17 @@ def detect_signs(
     *,
     frame_rate_hz: float,
     errors: VehicleErrors = NO_ERRORS,
+    streets: StreetGrid | None = None,
 ) -> SignRows:
-    """All sign detections of a drive, frame after frame, in random order within a frame; `camera` is the true one."""
+    """All sign detections of a drive, frame after frame, in random order within a frame; `camera` is the true one.
+
+    In a city houses hide what does not stand along the street.
+    """
     # Jitter has a stream of its own: without it everything else is drawn as with it.
     (jitter_rng,) = rng.spawn(1)
-    frame, sign, corners = _visible(signs, Shutter(drive, camera, errors.read_out_s), config)
+    frame, sign, corners = _visible(
+        signs, Shutter(drive, camera, errors.read_out_s), config, streets
+    )
     kept = rng.random(len(frame)) >= config.missed
     kept &= ~_is_hidden(frame, sign, len(signs), config, rng, frame_rate_hz)
     frame, sign, corners = frame[kept], sign[kept], corners[kept]
@@ -86,7 +94,7 @@ def detect_signs(
 
 
 def _visible(
-    signs: WorldSigns, shutter: Shutter, config: SignDetectionConfig
+    signs: WorldSigns, shutter: Shutter, config: SignDetectionConfig, streets: StreetGrid | None
 ) -> tuple[Int[np.ndarray, " d"], Int[np.ndarray, " d"], Float[np.ndarray, "d 8 2"]]:
     """Frame, sign and exact corners [px] of all that a perfect detector would see."""
     corners_world, drive = signs.corners(), shutter.drive
@@ -94,18 +102,40 @@ def _visible(
     for first in range(0, len(drive), _CHUNK_FRAMES):
         rows = slice(first, first + _CHUNK_FRAMES)
         p, R = drive.p_world_camera[rows], drive.R_world_camera[rows]
-        ray = signs.center[None] - p[:, None]
+        near = _near(signs, p, shutter.camera, config)
+        ray = signs.center[None, near] - p[:, None]
         distance = np.linalg.norm(ray, axis=-1)
         depth = np.einsum("fsk,fk->fs", ray, R[:, :, 2])
-        facing = -np.einsum("fsk,sk->fs", ray, signs.normal) / np.maximum(distance, 1e-9)
+        facing = -np.einsum("fsk,sk->fs", ray, signs.normal[near]) / np.maximum(distance, 1e-9)
         seen = (depth > config.range_m[0]) & (depth < config.range_m[1])
         frame, sign = np.nonzero(seen & (facing > np.cos(np.radians(config.view_angle_deg))))
-        frame = frame + first
+        if streets is not None:
+            is_open = streets.sees(p[frame, :2], signs.center[near[sign], :2])
+            frame, sign = frame[is_open], sign[is_open]
+        frame, sign = frame + first, near[sign]
         _, px, visible = shutter.see(corners_world[sign], frame)
         whole = visible.all(-1) & (_boxes(px).max(-1) >= config.min_box_px)
         found.append((frame[whole], sign[whole], px[whole]))
     frame, sign, corners = (np.concatenate(column) for column in zip(*found, strict=True))
     return frame, sign, corners
+
+
+def _near(
+    signs: WorldSigns,
+    p_world: Float[np.ndarray, "f 3"],
+    camera: Camera,
+    config: SignDetectionConfig,
+) -> Int[np.ndarray, " n"]:
+    """Signs that some of the cameras may see: none is farther off than a corner of the picture at the range's end."""
+    if not len(p_world):
+        return np.arange(len(signs))
+    size = torch.tensor([camera.width, camera.height], dtype=camera.K.dtype)
+    corner = torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]], dtype=camera.K.dtype) * (size - 1)
+    ray, closes = unproject(camera, corner)
+    off_axis = float(ray.norm(dim=-1).max()) if closes.all() else np.tan(MAX_OFF_AXIS)
+    reach = 1.2 * config.range_m[1] * np.hypot(1.0, off_axis) + 10.0
+    low, high = p_world.min(0) - reach, p_world.max(0) + reach
+    return np.flatnonzero(((signs.center > low) & (signs.center < high)).all(-1))
 
 
 def _with_habits(

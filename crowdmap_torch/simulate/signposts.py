@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ SHARES = {
     "pentagon": 0.08,
 }
 """How common shapes are, before they are scaled to 1."""
+NAME_CODE = "US:D3-1"
+"""Of the name of a street."""
 PANEL_CODES = ("US:E1-5", "US:E5-1", "US:E6-2")
 """Of the large panels of a gantry."""
 
@@ -191,6 +194,19 @@ class _Builder:
         self.hang("rectangle", code, base, travel, rise, 0.0, size, wear=0.2)
         self.posts += 1
 
+    def signs(self) -> WorldSigns:
+        """All that were put up so far."""
+        rows = self.rows
+        return WorldSigns(
+            sign_id=tuple(f"sign-{k:03d}" for k in range(len(rows))),
+            shape=np.array([row[0] for row in rows], dtype=np.int64),
+            code=tuple(row[1] for row in rows),
+            post=np.array([row[2] for row in rows], dtype=np.int64),
+            center=np.array([row[3] for row in rows]).reshape(-1, 3),
+            R_world_sign=np.array([row[4] for row in rows]).reshape(-1, 3, 3),
+            size=np.array([row[5] for row in rows]).reshape(-1, 2),
+        )
+
 
 def put_up_signs(
     road: Road,
@@ -225,15 +241,42 @@ def put_up_signs(
                 for k in range(count):
                     station = first + spacing * (k + rng.uniform(0.3, 0.7))
                     put_up(station, lane_centres[direction], direction)
-    rows = builder.rows
+    return builder.signs()
+
+
+def put_up_corner_post(
+    road: Road,
+    config: SignConfig,
+    rng: np.random.Generator,
+    *,
+    place: tuple[float, float],
+    direction: int,
+    must_stop: bool,
+) -> WorldSigns:
+    """A post at a street's corner, at a station and an offset: the name of the street that crosses, and a sign to stop."""
+    builder = _Builder(road, config, rng)
+    station, offset = (np.array(number) for number in place)
+    base = road.surface(station, offset)
+    travel = direction * road.tangent_frame(station, offset)[:, 0]
+    if must_stop:
+        builder.hang("octagon", "US:R1-1", base, travel, 2.2, 0.0, (0.75, 0.75))
+    name_m = (float(rng.uniform(0.8, 1.2)), 0.3)
+    builder.hang("rectangle", NAME_CODE, base, travel, 2.9, 0.0, name_m)
+    return builder.signs()
+
+
+def join_signs(parts: Sequence[WorldSigns]) -> WorldSigns:
+    """The signs of many roads, numbered anew."""
+    posts = [0, *np.cumsum([part.post.max(initial=-1) + 1 for part in parts])]
+    count = sum(len(part) for part in parts)
     return WorldSigns(
-        sign_id=tuple(f"sign-{k:03d}" for k in range(len(rows))),
-        shape=np.array([row[0] for row in rows], dtype=np.int64),
-        code=tuple(row[1] for row in rows),
-        post=np.array([row[2] for row in rows], dtype=np.int64),
-        center=np.array([row[3] for row in rows]).reshape(-1, 3),
-        R_world_sign=np.array([row[4] for row in rows]).reshape(-1, 3, 3),
-        size=np.array([row[5] for row in rows]).reshape(-1, 2),
+        sign_id=tuple(f"sign-{k:03d}" for k in range(count)),
+        shape=np.concatenate([part.shape for part in parts]),
+        code=tuple(code for part in parts for code in part.code),
+        post=np.concatenate([part.post + n for part, n in zip(parts, posts, strict=False)]),
+        center=np.concatenate([part.center for part in parts]),
+        R_world_sign=np.concatenate([part.R_world_sign for part in parts]),
+        size=np.concatenate([part.size for part in parts]),
     )
 
 

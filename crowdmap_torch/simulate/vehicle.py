@@ -23,6 +23,7 @@ from crowdmap_torch.ranges import (
 )
 from crowdmap_torch.simulate.passing import Passing
 from crowdmap_torch.simulate.rigs import SimulatedRig
+from crowdmap_torch.simulate.sight import Sight
 from crowdmap_torch.simulate.worlds import World
 
 _STEP_M = 0.5
@@ -88,7 +89,7 @@ class Drive:
     road_normal_camera: Float[np.ndarray, "f 3"]
     """True unit normal from the camera towards the road."""
     camera_height: Float[np.ndarray, " f"]
-    passing: Passing | None = None
+    passing: Passing | Sight | None = None
     """Where it is beside markers that do not follow the stations."""
 
     def __len__(self) -> int:

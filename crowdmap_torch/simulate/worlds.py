@@ -9,10 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from crowdmap_torch.ranges import LengthOrNone, Range, Rate, Settings, Span, Speed
+from crowdmap_torch.simulate.city import city_markers, city_signs
 from crowdmap_torch.simulate.markers import Markers, Strip, lay_markers
 from crowdmap_torch.simulate.recordings import Recording
 from crowdmap_torch.simulate.roads import Road, RoadShape, block_road, open_road
+from crowdmap_torch.simulate.routes import drive_route
 from crowdmap_torch.simulate.signposts import SignConfig, WorldSigns, put_up_signs
+from crowdmap_torch.simulate.street_grid import CityConfig, StreetGrid, street_grid
 from crowdmap_torch.tables import Origin
 
 ORIGIN = Origin(32.9, -117.2, 120.0)
@@ -53,6 +56,7 @@ class WorldConfig(Settings):
     """Cruising speed of the cars there."""
     both_directions: bool = False
     """True: every second journey drives against the stations."""
+    city: CityConfig = field(default_factory=CityConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,6 +64,16 @@ class WorldConfig(Settings):
             raise ValueError("no lane to drive in: expected at least one in each driven direction")
 
 
+CITY = WorldConfig(
+    name="city",
+    length_m=8000.0,
+    road=RoadShape(grade=0.025, grade_wavelength_m=400),
+    signs=SignConfig(posts_per_km=16.0, opposite_share=1.0),
+    lights_per_km=2.0,
+    speed_mps=11.0,
+    city=CityConfig(square_m=4000.0),
+)
+"""Streets that cross on a square of 4 km; each drive takes a route of its own."""
 WORLD_PRESETS: dict[str, WorldConfig] = {
     "street": WorldConfig(
         name="street",
@@ -126,6 +140,7 @@ WORLD_PRESETS: dict[str, WorldConfig] = {
         both_directions=True,
     ),
 }
+"""Worlds of one road."""
 
 
 @dataclass(frozen=True)
@@ -146,11 +161,15 @@ class World:
     """Drives that are driven again; none: cars drive along the road."""
     is_map: bool = False
     """Whether its markers are those of a map, which do not follow the stations."""
+    streets: StreetGrid | None = None
+    """Of a city, whose drives take routes of their own; `road` and `lights` are those of one."""
 
 
 def build_world(config: WorldConfig, rng: np.random.Generator) -> World:
     """The world of a configuration and a seed."""
     width = rng.uniform(*config.lane_width_m)
+    if config.city.square_m:
+        return _city(config, width, rng)
     if config.closed:
         road = block_road(config.road, config.length_m, rng)
         signs_from, signs_to = 0.0, road.length
@@ -182,6 +201,37 @@ def build_world(config: WorldConfig, rng: np.random.Generator) -> World:
         lane_centres=centres,
         lights=lights,
     )
+
+
+def _city(config: WorldConfig, width: float, rng: np.random.Generator) -> World:
+    ground_rng, sign_rng, route_rng = rng.spawn(3)
+    grid = street_grid(
+        config.city,
+        config.road,
+        ground_rng,
+        lane_width=width,
+        lanes=config.lanes_ahead,
+        lights_per_km=config.lights_per_km,
+    )
+    first = drive_route(grid, config.length_m, route_rng, changes_per_km=0.0)
+    return World(
+        config=config,
+        road=first.road,
+        markers=city_markers(grid, dash_m=config.dash_m, gap_m=config.gap_m),
+        signs=city_signs(grid, config.signs, sign_rng),
+        lane_centres={1: (0.0,)},
+        lights=first.lights,
+        streets=grid,
+    )
+
+
+def on_route(world: World, rng: np.random.Generator, *, changes_per_km: float) -> World:
+    """A city as one drive passes it: along a route of its own; any other world as it is."""
+    if world.streets is None:
+        return world
+    length = world.config.length_m + RUN_IN_M + 60.0
+    route = drive_route(world.streets, length, rng, changes_per_km=changes_per_km)
+    return replace(world, road=route.road, lights=route.lights)
 
 
 def _strips(
