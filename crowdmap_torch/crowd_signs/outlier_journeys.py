@@ -20,7 +20,7 @@ class OutlierJourneyConfig(Settings):
     """When a journey is taken for a bad drive. Limits are in the crowd's own robust spread where they say so."""
 
     min_signs: Count = 4
-    """Journeys with fewer signs are not judged."""
+    """Journeys with fewer signs are not judged, and not by what others saw unless as many stand where others passed by."""
     spread: Deviations = 6.0
     """Figures further from the crowd's median than this many robust standard deviations are suspicious."""
     min_matched: Share = 0.5
@@ -65,6 +65,8 @@ class JourneyStatistics:
 
     signs: Int[Tensor, " j"]
     """Signs triangulated."""
+    checked: Int[Tensor, " j"]
+    """Those of them that others passed by."""
     matched: Float[Tensor, " j"]
     """Share of them that other journeys saw too, of those that others passed by."""
     bias: Float[Tensor, " j"]
@@ -131,6 +133,7 @@ def journey_statistics(
     centre = translation.median(0).values if journeys else translation.sum(0)
     return JourneyStatistics(
         signs=number,
+        checked=checked,
         matched=torch.where(checked > 0, matched, torch.nan),
         bias=(translation - centre).norm(dim=1),
         scatter=median(miss),
@@ -153,7 +156,9 @@ def find_outlier_journeys(
     if int(judged.sum()) < _LEAST_JOURNEYS:
         judged = torch.zeros_like(judged)
     usual = statistics.matched[judged].nanmedian()
-    few = judged & (statistics.matched < config.min_matched * usual)
+    # Who meets others only where their ways cross was seen to be wrong by nobody.
+    few = judged & (statistics.checked >= config.min_signs)
+    few &= statistics.matched < config.min_matched * usual
     s, radian = statistics, torch.pi / 180
     outlying = partial(_outlying, judged=judged, spread=config.spread)
     checks = (

@@ -27,6 +27,7 @@ def calm() -> JourneyStatistics:
     small = 0.01 * torch.arange(JOURNEYS).double()
     return JourneyStatistics(
         signs=torch.full((JOURNEYS,), 20),
+        checked=torch.full((JOURNEYS,), 15),
         matched=0.9 + small,
         bias=0.5 + small,
         scatter=0.1 + small,
@@ -145,6 +146,16 @@ def test_turns_of_signs_are_told_apart(axis: tuple[float, float, float], column:
 def test_what_nobody_else_passed_by_does_not_count_as_unmatched():
     found = statistics_of(torch.tensor([True, *[False] * 5]))
     assert found.matched[0] == 1 and found.matched[1].isnan()
+
+
+def test_nobody_is_judged_by_few_signs_where_others_passed_by():
+    # As a drive through a city that meets others at crossings alone.
+    unseen = with_journey("matched", 4, 0.0)
+    assert [found.journey for found in find_outlier_journeys(unseen, CONFIG)] == [4]
+    checked = unseen.checked.clone()
+    checked[4] = CONFIG.min_signs - 1
+    assert find_outlier_journeys(replace(unseen, checked=checked), CONFIG) == ()
+    assert statistics_of(torch.tensor([True, *[False] * 5])).checked.tolist() == [1, 0]
 
 
 def test_what_few_signs_say_that_others_saw_too_is_not_judged():
