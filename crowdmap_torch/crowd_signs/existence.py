@@ -25,7 +25,7 @@ class ExistenceConfig(Settings):
     """A journey passed by a sign if it came this close to where others saw it from, heading the same way [m]."""
     tentative: Share = 0.45
     """Most confidence of a sign that too few journeys saw."""
-    cell_m: Spacing = 50.0
+    cell_m: Spacing = 25.0
     """Cells in which journeys are counted that could have seen a single sign [m]."""
 
 

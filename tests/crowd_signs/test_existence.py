@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from worlds.crowd_world import World, make_world
 
@@ -81,6 +82,24 @@ def test_those_who_drive_the_other_way_are_no_company():
     east = world.crowd.view_direction[:, 0] > 0
     # Three drive east, so each has two others; the two who drive west have one.
     assert company[east].all() and not company[~east].any()
+
+
+@pytest.mark.parametrize("corner", [205.0, 225.0, 255.0])
+def test_those_who_turned_off_at_the_last_crossing_are_no_company(corner: float):
+    crowd = street(4).crowd
+    along = crowd.path_position[:, 0]
+    stays = (crowd.path_journey == 0) | (along < corner)
+    turned_off = replace(
+        crowd,
+        path_position=crowd.path_position[stays],
+        path_direction=crowd.path_direction[stays],
+        path_journey=crowd.path_journey[stays],
+    )
+    beyond = crowd.view_position[:, 0] - corner
+    company = has_company(turned_off, CONFIG)
+    assert (beyond < 0).any() and company[beyond < 0].all()
+    # Bad drives may be off by 20 m and more, and are to be noticed: so far nobody has left the others.
+    assert (beyond > 50).any() and not company[beyond > 50].any()
 
 
 def test_company_does_not_depend_on_the_order_of_signs():
