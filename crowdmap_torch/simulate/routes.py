@@ -33,7 +33,7 @@ def drive_route(
     grid: StreetGrid, length_m: float, rng: np.random.Generator, *, changes_per_km: float
 ) -> Route:
     """A random route of at least `length_m`."""
-    corners = _corners(grid, length_m, rng)
+    corners = random_corners(grid, length_m, rng)
     blocks = list(pairwise(corners))
     turns = [_turn(a, b, d) for (a, b), (_, d) in pairwise(blocks)] + [0]
     pieces: list[np.ndarray] = []
@@ -70,8 +70,8 @@ def drive_route(
     return Route(road, lights[(lights > 20.0) & (lights < road.length - 20.0)])
 
 
-def _corners(grid: StreetGrid, length_m: float, rng: np.random.Generator) -> list[Corner]:
-    """Crossings one after another, until the way between them is long enough."""
+def random_corners(grid: StreetGrid, length_m: float, rng: np.random.Generator) -> list[Corner]:
+    """Crossings one after another, until the way between them is long enough; every street is as likely as any other."""
     blocks = list(grid.way)
     begin, end = blocks[int(rng.integers(len(blocks)))]
     if rng.random() < 0.5:
@@ -85,7 +85,8 @@ def _corners(grid: StreetGrid, length_m: float, rng: np.random.Generator) -> lis
         for side in (1, -1):
             aims[k - side * ahead[1], m + side * ahead[0]] = share / 2
         aims = {aim: p for aim, p in aims.items() if _block((k, m), aim) in grid.way}
-        chance = np.array([max(p, 1e-9) for p in aims.values()])
+        # Where a street ends at another, all ways alike: drives would gather along the city's border.
+        chance = np.array([p if len(aims) == 3 else 1.0 for p in aims.values()])
         aim = list(aims)[int(rng.choice(len(aims), p=chance / chance.sum()))]
         block = _block((k, m), aim)
         # Markers' gaps are left out: across a crossing a turn is shorter than its street.

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from crowdmap_torch.simulate.dataset import (
 )
 from crowdmap_torch.simulate.lane_perception import DAY, detect_lanes
 from crowdmap_torch.simulate.roads import SPACING_M
+from crowdmap_torch.simulate.routes import random_corners
 from crowdmap_torch.simulate.sign_perception import detect_signs
 from crowdmap_torch.simulate.street_grid import CityConfig
 from crowdmap_torch.simulate.vehicle import VehicleConfig
@@ -119,6 +121,19 @@ def test_drives_stay_in_a_lane_on_the_right_and_turn_to_both_sides(
             on_it = inside & (np.abs(left) < 8.0)
             assert (left[on_it] < -0.5).all(), "the line in the middle is on the driver's left"
     assert np.max(turned) > 1.0 and np.min(turned) < -1.0
+
+
+def test_all_streets_are_driven_alike(city: World):
+    grid = city.streets
+    assert grid is not None
+    count = dict.fromkeys(grid.way, 0)
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        for a, b in pairwise(random_corners(grid, 3000.0, rng)):
+            count[min(a, b), max(a, b)] += 1
+    often = np.array(list(count.values()))
+    # About 200 visits each: by chance 7 % at 1 sigma, and more as one visit leads to another.
+    assert often.min() > 0.7 * often.mean() and often.max() < 1.4 * often.mean()
 
 
 def test_cars_slow_down_where_they_turn(journeys: list[SimulatedJourney]):
