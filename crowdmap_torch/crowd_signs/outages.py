@@ -16,7 +16,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import cheapest, distinct_pairs
 from crowdmap_torch.clustering.neighbours import cross_pairs
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance
-from crowdmap_torch.ranges import Cost, Count, Factor, Length, Settings
+from crowdmap_torch.ranges import Cost, Count, Deviations, Factor, Length, Settings
 from crowdmap_torch.tables import Signs
 
 
@@ -28,6 +28,9 @@ class OutageConfig(Settings):
     """A sign that is further from one which the others saw is not that sign."""
     min_miss_m: Length = 0.8
     """Least displacement that is taken for an outage; of less the drift is told as ever."""
+    sure: Deviations = 3.0
+    """Least displacement in standard deviations of where the drive by itself has the sign: who turns off before a sign
+    has seen it from afar alone, and hardly knows how far it was."""
     anchor_m: Length = 0.5
     """Signs that are this near to the others' show that the positions are right again."""
     looks_cost: Cost = 9.0
@@ -83,8 +86,11 @@ def displaced_by(
     most = (config.more * own).clamp_min(config.min_journeys)
     likely = ~seen[head * journeys + journey[row]] & (count[head] >= most)
     likely &= appearance_distance(unbiased[row], heads[head], similarity) <= config.looks_cost
-    distance = (unbiased.center_world[row] - heads.center_world[head]).norm(dim=1)
-    likely &= distance >= config.min_miss_m
+    off = unbiased.center_world[row] - heads.center_world[head]
+    distance = off.norm(dim=1)
+    along = off / distance.clamp_min(1e-9)[:, None]
+    variance = ((along[:, None] @ unbiased.covariance[row])[:, 0] * along).sum(1)
+    likely &= (distance >= config.min_miss_m) & (distance >= config.sure * variance.sqrt())
     best, of = cheapest(row[likely], head[likely], distance[likely], n)
     return torch.where((of >= 0) & trusted, best, away)
 

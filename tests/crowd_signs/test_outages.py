@@ -9,7 +9,7 @@ import torch
 from worlds.crowd_world import World, make_world
 
 from crowdmap_torch.crowd_signs.cluster import moved
-from crowdmap_torch.crowd_signs.outages import Outage, outside_outages
+from crowdmap_torch.crowd_signs.outages import Outage, displaced_by, outside_outages
 from crowdmap_torch.crowd_signs.register import Crowd, CrowdConfig, register_crowd
 from crowdmap_torch.noise.positioning import PositioningNoise
 
@@ -43,6 +43,28 @@ def test_an_outage_is_found_and_nothing_else(seed: int):
     # What was displaced is in no cluster, and no cluster is of displaced signs alone.
     assert crowd.displaced.any() and (crowd.label[crowd.displaced] < 0).all()
     assert (world.crowd.signs.journey[crowd.displaced] == 3).all()
+
+
+def test_a_sign_whose_place_its_drive_hardly_knows_is_no_outage():
+    world = make_world(0, journeys=_JOURNEYS, bias_m=0.3, fragments=0.0, ghosts=0.0)
+    crowd = registered(world)
+    signs = world.crowd.signs
+    displaced = with_outage(world, 3, 4.0).crowd.signs
+    unknown = displaced.covariance + 4.0 * torch.eye(3, dtype=torch.float64)
+    config = CrowdConfig()
+    trusted = torch.ones(len(signs), dtype=torch.bool)
+    is_out = (signs.journey == 3) & (displaced.center_world != signs.center_world).any(1)
+    label = crowd.label.masked_fill(is_out, -1)
+
+    def found(covariance: torch.Tensor) -> int:
+        own = replace(displaced, covariance=covariance)
+        away = displaced_by(
+            own, label, crowd.heads, trusted, config.match.similarity, config.outages
+        )
+        return int((away[is_out] > 0).sum())
+
+    assert found(displaced.covariance) > 3
+    assert found(unknown) == 0
 
 
 def test_two_drives_that_are_off_alike_do_not_make_signs():
