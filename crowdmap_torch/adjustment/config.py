@@ -37,10 +37,14 @@ class AdjustConfig(Settings):
     say. `paper2017`: eq:ba with Tukey's weights of every corner and lane point by itself, all pixels weighed alike."""
     lm: lm.LmConfig = field(
         default_factory=lambda: lm.LmConfig(
-            max_iterations=30, cost_tolerance=5e-5, initial_damping=1e-9, max_stretch=3.0
+            max_iterations=30,
+            cost_tolerance=5e-5,
+            move_tolerance=0.03,
+            initial_damping=1e-9,
+            max_stretch=3.0,
         )
     )
-    """The solver; its tolerance counts once the scales stand still."""
+    """The solver; its tolerances count once the scales stand still."""
     jacobians: str = "closed"
     """`autograd`: of every residual by autograd and the chain rule; `closed`: in closed form where there is one, which is
     faster and the same."""

@@ -36,7 +36,9 @@ from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.ranges import Rounds, Workers, argument
 
-MINIMISATION = replace(AdjustConfig().lm, max_iterations=100, cost_tolerance=1e-6)
+MINIMISATION = replace(
+    AdjustConfig().lm, max_iterations=100, cost_tolerance=1e-6, move_tolerance=0.0
+)
 """The mapper's own, but that both stages stop when a step lowers the cost by less than a millionth, as the peers do."""
 PEERS = {"ceres": "peers/ceres.py", "gtsam": "peers/gtsam.py"}
 SERIES = ((5, 100, 10), (5, 500, 31), (25, 500, 31), (100, 500, 31), (400, 500, 31), (25, 500, 200))

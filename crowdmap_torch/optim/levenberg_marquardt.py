@@ -20,7 +20,7 @@ from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import Backend, NormalEquations
 from crowdmap_torch.ranges import Damping, Factor, RoundsOrNone, Settings, Share
 
-RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE = range(5)
+RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE, CONVERGED_MOVE = range(6)
 _NEAR_BEST = 0.2
 """Steps that should be longer or shorter by less than this share stay as they are."""
 REASONS = (
@@ -29,6 +29,7 @@ REASONS = (
     "converged: the step is below its tolerance",
     "stalled: no damping up to the largest gives a lower cost",
     "failed: the cost is not finite at the start",
+    "converged: the step is lost in how little is known",
 )
 """What a reason code of `LmState.reason` means."""
 
@@ -43,6 +44,9 @@ class LmConfig(Settings):
     """Stop when an accepted step lowers the cost by less than this share of it."""
     step_tolerance: Share = 1e-10
     """Stop when the step's norm, in tangent units, is below this."""
+    move_tolerance: Share = 0.0
+    """Stop when an accepted step moves the unknowns that are solved for last (a map's landmarks) by less than this share of
+    their own standard deviations, as root mean square: the rest is lost in how little is known of them. 0: never."""
     initial_damping: Damping = 1e-4
     """First damping, relative to the Hessian's diagonal."""
     max_damping: Damping = 1e12
@@ -142,6 +146,8 @@ def step(
     # Where the model itself promises next to nothing, a rejection is rounding and not a bad step.
     nothing_left = proposal.solved & ~accepted & (proposal.predicted <= 1e-3 * tolerance)
     reason[running & ((accepted & (decrease <= tolerance)) | nothing_left)] = CONVERGED_COST
+    lost = accepted & (proposal.in_sigmas * length < config.move_tolerance)
+    reason[running & lost & (reason == RUNNING)] = CONVERGED_MOVE
     tiny = proposal.solved & (proposal.norm < config.step_tolerance)
     reason[running & tiny & (reason == RUNNING)] = CONVERGED_STEP
     reason[running & ~accepted & (damping > config.max_damping) & (reason == RUNNING)] = STALLED

@@ -12,6 +12,7 @@ from crowdmap_torch.optim.linearize import autograd_jacobians, linearize, rows, 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
 from crowdmap_torch.optim.robust import Huber, Quadratic, Tukey, median_scale
 from crowdmap_torch.optim.solvers.dense import DenseBackend
+from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
 
 ROWS = 40
 
@@ -70,6 +71,20 @@ def test_the_cost_never_rises():
         after = lm.step(problem, state, lm.LmConfig())
         assert (after.cost <= state.cost).all()
         state = after
+
+
+def test_a_step_that_is_lost_in_how_little_is_known_is_the_last():
+    problem, true = curves(20, outliers=True)
+    exact = lm.solve(problem, {"x": true + 0.02}, lm.LmConfig(cost_tolerance=1e-12))
+    config = lm.LmConfig(cost_tolerance=0.0, move_tolerance=0.1)
+    early = lm.solve(problem, {"x": true + 0.02}, config)
+    assert set(early.reason.tolist()) == {lm.CONVERGED_MOVE}
+    assert early.iterations < exact.iterations
+    inverse = DenseBackend().assemble(problem, exact.values).covariance()
+    every = torch.arange(len(true))
+    sigma = inverse.of(LinearFunctions.of_tangents((("x", every),), true, 2)).diagonal(0, 1, 2)
+    left = (early.values["x"] - exact.values["x"]) / sigma.sqrt()
+    assert float(left.square().mean().sqrt()) < 0.1
 
 
 def test_a_rejected_step_keeps_the_linearisation():

@@ -177,13 +177,15 @@ class BandNormalEquations:
         reduced = self._reduced(own_added, path_added)
         if reduced is None:
             return failed_step(self._unpack(self.own_gradient, self.path_gradient), self.cost)
-        path_step = -reduced.path.solve(self._reduced_gradient(reduced)[:, None])[:, 0]
+        gradient = self._reduced_gradient(reduced)
+        path_step = -reduced.path.solve(gradient[:, None])[:, 0]
         bound = (self.coupling @ path_step[self.columns()][..., None])[..., 0]
         own_step = -(reduced.inverse @ (self.own_gradient + bound)[..., None])[..., 0]
         return solved_step(
             self._unpack(own_step, path_step),
             StepPart(own_step[None], self.own_gradient[None], own_added[None]),
             StepPart(path_step[None], self.path_gradient[None], path_added[None]),
+            last=(StepPart.alone(path_step, gradient),),
         )
 
     def covariance(self) -> BandCovariance:

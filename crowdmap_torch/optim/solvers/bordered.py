@@ -120,7 +120,9 @@ class BorderedNormalEquations:
         x = inner.substitute(y, linked)
         delta = {**inner.unpack(x, y), **self.layout.unpack(z[None])}
         parts = inner.step_parts(x, y, added_x, added_y)
-        return solved_step(delta, *parts, StepPart(z[None], self.gradient[None], added[None]))
+        last = (StepPart.alone(y, right_side), StepPart.alone(z, self.gradient - reduced.gradient))
+        border = StepPart(z[None], self.gradient[None], added[None])
+        return solved_step(delta, *parts, border, last=last)
 
     def _failed(self) -> Step:
         inner, nothing = self.inner, torch.zeros_like(self.gradient)

@@ -191,7 +191,8 @@ class ChainNormalEquations:
             return failed_step(self.unpack(self.eliminated_gradient, self.gradient), self.cost)
         y = -self.solve_reduced(right_side[:, None])[:, 0]
         x = self.substitute(y, self.eliminated_gradient)
-        return solved_step(self.unpack(x, y), *self.step_parts(x, y, added_x, added_y))
+        parts = self.step_parts(x, y, added_x, added_y)
+        return solved_step(self.unpack(x, y), *parts, last=(StepPart.alone(y, right_side),))
 
     def damped_by(
         self, damping: Float[Tensor, " 1"]

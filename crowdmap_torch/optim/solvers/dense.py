@@ -79,7 +79,8 @@ class DenseNormalEquations:
         step = -torch.cholesky_solve(self.gradient[..., None], factor)[..., 0]
         step = torch.where(solved[:, None], step, torch.zeros_like(step))
         part = StepPart(step, self.gradient, added)
-        return solved_step(self.where.unpack(step), part, solved=solved)
+        count = self.where.used.sum(1).to(step)
+        return solved_step(self.where.unpack(step), part, count=count, solved=solved)
 
     def covariance(self, *, floor: float = 1e-12) -> DenseCovariance:
         """Inverse of the Gauss-Newton Hessian; padding and unobserved directions get a large variance.

@@ -12,7 +12,7 @@ equations, as covariances of linear functions of the tangents.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -40,6 +40,9 @@ class Step:
     """False where the matrix was not positive definite."""
     norm: Float[Tensor, " groups"]
     """Length of the step in tangent units."""
+    in_sigmas: Float[Tensor, " groups"]
+    """By how many of their own standard deviations the unknowns that are solved for last move, all others free: the root
+    mean square over their number, whichever way they are correlated."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +54,24 @@ class StepPart:
     added: Float[Tensor, "groups ..."]
     """What the damping adds to the Hessian's diagonal, D."""
 
+    @classmethod
+    def alone(cls, step: Float[Tensor, " n"], gradient: Float[Tensor, " n"]) -> StepPart:
+        """Those of one problem, of whose damping nothing is said."""
+        return cls(step[None], gradient[None], torch.zeros_like(step)[None])
+
 
 def solved_step(
-    delta: Tangents, *parts: StepPart, solved: Bool[Tensor, " groups"] | None = None
+    delta: Tangents,
+    *parts: StepPart,
+    last: Sequence[StepPart] | None = None,
+    count: Float[Tensor, " groups"] | None = None,
+    solved: Bool[Tensor, " groups"] | None = None,
 ) -> Step:
-    """The step `delta`, whose unknowns are those of `parts`; `solved` where it is finite, unless told otherwise."""
+    """The step `delta`, whose unknowns are those of `parts`; `solved` where it is finite, unless told otherwise.
+
+    `last` are those that are solved for last, with the gradient that the elimination of the others has left (None: all
+    are), and `count` is how many they are (None: as many as there are numbers).
+    """
     along, damped, squared = (
         torch.stack([term.flatten(1).sum(1) for term in terms]).sum(0)
         for terms in (
@@ -66,14 +82,25 @@ def solved_step(
     )
     norm = squared.sqrt()
     solved = norm.isfinite() if solved is None else solved
-    return Step(delta, torch.where(solved, (damped - along) / 2, 0.0), solved, norm)
+    predicted = torch.where(solved, (damped - along) / 2, 0.0)
+    return Step(delta, predicted, solved, norm, _in_sigmas(parts if last is None else last, count))
+
+
+def _in_sigmas(
+    last: Sequence[StepPart], count: Float[Tensor, " groups"] | None
+) -> Float[Tensor, " groups"]:
+    """The root of the mean of s.S s, which is -g.s, for the step s and the gradient g of what has the information S."""
+    along = torch.stack([(of.gradient * of.step).flatten(1).sum(1) for of in last]).sum(0)
+    if count is None:
+        count = torch.full_like(along, sum(of.step[0].numel() for of in last))
+    return (-along / count.clamp_min(1)).clamp_min(0).sqrt()
 
 
 def failed_step(like: Tangents, cost: Float[Tensor, " groups"]) -> Step:
     """The step that moves nothing, as the matrix is not positive definite; `like` are tangents of its shapes."""
     still = {name: torch.zeros_like(tangent) for name, tangent in like.items()}
     nothing = torch.zeros_like(cost)
-    return Step(still, nothing, torch.zeros_like(cost, dtype=torch.bool), nothing)
+    return Step(still, nothing, torch.zeros_like(cost, dtype=torch.bool), nothing, nothing)
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,22 @@ def test_a_border_gives_the_dense_step(lengths, world):
 
 
 @pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
+def test_a_step_tells_by_how_many_sigmas_landmarks_and_border_move(world):
+    problem, values, plan = world()
+    dense = DenseBackend().assemble(problem, values)
+    damping = torch.tensor([1e-12], dtype=torch.float64)
+    step = BorderedBackend(plan).assemble(problem, values).solve(damping)
+    gone = torch.cat([rows_of(dense, name) for name in ("pose", "drift")])
+    stays = torch.ones(dense.where.dim, dtype=torch.bool)
+    stays[gone] = False
+    # Their own covariance, all others free: of the inverse what is theirs.
+    covariance = torch.linalg.inv(dense.hessian[0])[stays][:, stays]
+    moved = dense.where.pack(step.delta)[0][stays]
+    expected = (moved @ torch.linalg.solve(covariance, moved) / len(moved)).sqrt()
+    torch.testing.assert_close(step.in_sigmas[0], expected, rtol=1e-7, atol=0)
+
+
+@pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
 def test_covariances_are_blocks_of_the_dense_inverse(world):
     problem, values, plan = world()
     dense = DenseBackend().assemble(problem, values)
