@@ -37,7 +37,7 @@ from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.noise.pose_evidence import pose_evidence
-from crowdmap_torch.noise.pose_prior import DriftNodes, drift_nodes, pose_prior
+from crowdmap_torch.noise.pose_prior import MOST_NUMBERS, DriftNodes, drift_nodes, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm
@@ -100,7 +100,7 @@ def build(
     at_nodes = drift[frame][nodes.first]
     lane = spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count)
     place, unknowns = given[frame][nodes.first][:, :2, 3], 8 * len(signs) + lane.numel()
-    cut = cut_drives(place, nodes.journey, unknowns, config.cut_unknowns)
+    cut = cut_drives(place, nodes.journey, unknowns, config.cut_unknowns, at_cut=MOST_NUMBERS)
     poses = pose_prior(
         *(journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior, cut),
         error=at_nodes[:, :3],

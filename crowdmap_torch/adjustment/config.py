@@ -95,8 +95,9 @@ class AdjustConfig(Settings):
     frame_spacing_m: Spacing = 0.25
     """Frames closer together than this (a car at a light) are thinned."""
     cut_unknowns: CountOrNone = 800
-    """Drives over a larger map are cut into stretches along which signs and lanes have about so many unknowns, and
-    solved for between the cuts: time and memory grow with the way driven, no faster. 0: none is. The map is the same."""
+    """Drives over a larger map are cut into stretches along which signs and lanes have at most about so many unknowns, fewer
+    where few drives pass, and solved for between the cuts: time and memory grow with the way driven, no faster. 0: none
+    is. The map is the same."""
 
     def __post_init__(self) -> None:
         """Refuses unknown methods and Jacobians."""

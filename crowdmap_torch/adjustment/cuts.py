@@ -12,19 +12,37 @@ _ROAD_M = 50.0
 """Width of the squares by which the length of the roads driven is told."""
 _WHOLE = 2.0
 """Maps of at most so many times the unknowns of a square are not cut."""
+_LEAST = 100
+"""Unknowns of the landmarks in a square from which it is not halved any more."""
+_JOINTS = 0.5
+"""Unknowns at the cuts, at most, as a share of those of all landmarks: squares are halved as long as there are no more."""
 
 
 def cut_drives(
-    position: Float[Tensor, "n 2"], journey: Int[Tensor, " n"], unknowns: int, in_square: int
+    position: Float[Tensor, "n 2"],
+    journey: Int[Tensor, " n"],
+    unknowns: int,
+    in_square: int,
+    *,
+    at_cut: int,
 ) -> Int[Tensor, " s"]:
-    """The nodes that drives are cut before, where the landmarks of a square have about `in_square` unknowns.
+    """The nodes that drives are cut before, where the landmarks of a square have at most about `in_square` unknowns.
 
-    `unknowns` are those of all landmarks along the roads that the nodes are on.
+    `unknowns` are those of all landmarks along the roads that the nodes are on, `at_cut` those of one cut. What lies in a
+    square is bound to all else in it, and what is cut to the cuts: where few drives pass, squares are small.
     """
     if not in_square or unknowns <= _WHOLE * in_square or not len(position):
         return journey[:0]
-    squares = torch.unique((position / _ROAD_M).floor(), dim=0)
-    return cut_at_squares(position, journey, in_square / unknowns * len(squares) * _ROAD_M)
+    way_m = len(torch.unique((position / _ROAD_M).floor(), dim=0)) * _ROAD_M
+    share = in_square / unknowns
+    found = cut_at_squares(position, journey, share * way_m)
+    while share * unknowns >= 2 * _LEAST:
+        share /= 2
+        finer = cut_at_squares(position, journey, share * way_m)
+        if len(finer) * at_cut > _JOINTS * unknowns:
+            break
+        found = finer
+    return found
 
 
 def cut_at_squares(

@@ -36,6 +36,8 @@ CUT_TERMS = ("pose_before_cut", "pose_behind_cut")
 """The terms by which states at cuts are bound to the nodes around them."""
 _SWEEPS = 60
 """Alternations between scales and what all journeys share."""
+MOST_NUMBERS = 9
+"""Numbers of the drift at a node, at most."""
 LEAST_SIGMA_M = 1e-3
 """What carrier phases leave under the open sky of a receiver that stands still: who states less states nothing."""
 LEAST_SIGMA_RAD = 1e-5
@@ -121,7 +123,7 @@ class PosePrior:
     @property
     def numbers(self) -> int:
         """Numbers of the drift at a node."""
-        return 6 if self.wander is None else 9
+        return 6 if self.wander is None else MOST_NUMBERS
 
     def with_wander(self, error: Float[Tensor, "n 6"]) -> Float[Tensor, "n k"]:
         """Drift at the nodes where the poses' `error` is known there: with it how the bias wanders, where it may."""

@@ -54,14 +54,30 @@ def test_every_cut_is_within_a_journey():
     assert (found[1:] > found[:-1]).all() and len(found) == 4
 
 
-@pytest.mark.parametrize(("unknowns", "expected"), [(1600, 0), (4000, 3)])
-def test_stretches_have_about_so_many_unknowns(unknowns, expected):
+def cut_for(unknowns, in_square, *drives, at_cut=9):
+    journey = torch.repeat_interleave(
+        torch.arange(len(drives)), torch.tensor([len(d) for d in drives])
+    )
+    return cut_drives(torch.cat(drives), journey, unknowns, in_square, at_cut=at_cut)
+
+
+@pytest.mark.parametrize(("unknowns", "in_square", "expected"), [(600, 400, 0), (1600, 150, 10)])
+def test_stretches_have_about_so_many_unknowns(unknowns, in_square, expected):
     drive = along(0.0, 2000.0)
-    found = cut_drives(drive, torch.zeros(len(drive), dtype=torch.long), unknowns, 1000)
-    assert len(found) == expected
-    assert not len(cut_drives(drive, torch.zeros(len(drive), dtype=torch.long), unknowns, 0))
+    assert len(cut_for(unknowns, in_square, drive)) == expected
+    assert not len(cut_for(unknowns, 0, drive))
+
+
+def test_squares_are_halved_while_there_are_few_unknowns_at_cuts():
+    drive = along(0.0, 2000.0)
+    # To a hundred unknowns in a square where one drive passes, and not at all where forty do.
+    assert len(cut_for(3200, 800, drive)) == 31
+    many = len(cut_for(3200, 800, *[drive] * 40))
+    assert many == 40 * 3
+    # So many unknowns that half of the squares' would be too many.
+    assert 9 * many <= 0.5 * 3200 < 9 * len(cut_for(6400, 800, *[drive] * 40))
 
 
 def test_without_nodes_nothing_is_cut():
     none = torch.zeros(0, 2, dtype=torch.float64)
-    assert not len(cut_drives(none, torch.zeros(0, dtype=torch.long), 10_000, 100))
+    assert not len(cut_for(10_000, 100, none))
