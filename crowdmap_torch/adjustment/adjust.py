@@ -247,7 +247,7 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     state = lm.step(problem, state, bundle.config.lm, backend=backend)
     if not bool(state.accepted.all()):
         return state, state.done
-    evidence = pose_evidence(bundle.prior, normal, bundle.prior_scale, bundle.told())
+    evidence = bundle.evidence() or pose_evidence(bundle.prior, normal, bundle.prior_scale)
     # The next ones may need memory of their own.
     del normal
     bundle.fold(dict(state.values))

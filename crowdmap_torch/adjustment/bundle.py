@@ -59,7 +59,7 @@ _SCALE_STAYS = 0.005
 _SCALE_RESTS = 0.05
 """Scales of the prior of which none would change by more than this share are at rest: they are not known any better."""
 _TOLD_HOLDS = 0.02
-"""What observations tell of the drift is found anew where any scale has changed by more than this share since."""
+"""What observations tell of poses' errors is found anew where any scale has changed by more than this share since."""
 _WHITE_RESTS = 0.03
 """A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
 _LASTING_RESTS = 0.1
@@ -109,8 +109,10 @@ class Bundle(nn.Module):
     """By journey, how far the noise of positions and of rotations from frame to frame is from that of `prior`."""
     drift_told: Tensor
     """By journey and number of a pose, the share of the drift's changes that observations tell."""
+    poses_left: Tensor
+    """Variance that is left of every pose's deviation from its drift."""
     told_at: Tensor
-    """The scales by which that was found; NaN before."""
+    """The scales by which both were found; NaN before."""
 
     def __init__(
         self, unknowns: Unknowns, observations: Observations, priors: Priors, config: AdjustConfig
@@ -143,6 +145,7 @@ class Bundle(nn.Module):
         )
         self.register_buffer("white_scale", torch.ones_like(values["bias"][:, :2]))
         self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
+        self.register_buffer("poses_left", torch.zeros_like(self.delta_pose.detach()))
         self.register_buffer("told_at", torch.full_like(self._scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points
@@ -256,7 +259,8 @@ class Bundle(nn.Module):
         if evidence is not None:
             if evidence.told is not self.drift_told:
                 self.told_at.copy_(made_with)
-            self.drift_told.copy_(evidence.told)
+                self.drift_told.copy_(evidence.told)
+                self.poses_left.copy_(evidence.left)
             at_rest &= self._rescale_noise(values, evidence)
         rescaled = self.prior.rescaled(values["drift"], self.prior_scale, self.drift_told)
         moved = (rescaled / self.prior_scale).log().abs()
@@ -265,21 +269,16 @@ class Bundle(nn.Module):
         self.refreshed.fill_(True)
         return at_rest and not bool((moved > _SCALE_RESTS).any())
 
-    def told(self) -> Float[Tensor, "j k"] | None:
-        """`drift_told`, as long as the scales are what it was found by; None: it is to be found anew."""
+    def evidence(self) -> PoseEvidence | None:
+        """What was found last, as long as the scales are what it was found by; None: it is to be found anew."""
         holds = torch.isclose(self._scales(), self.told_at, rtol=_TOLD_HOLDS, atol=0)
-        return self.drift_told if bool(holds.all()) else None
+        return PoseEvidence(self.drift_told, self.poses_left) if bool(holds.all()) else None
 
     def _scales(self) -> Float[Tensor, " s"]:
-        """All scales that weigh observations and the prior."""
+        """All scales that weigh observations and the prior, and how often detections were judged."""
         corner = (self.scale[0].square() + self.lasting).sqrt()
-        parts = (
-            self.prior_scale.flatten(),
-            self.white_scale.flatten(),
-            self.scale[1:],
-            corner[None],
-        )
-        return torch.cat(parts)
+        of_pixels = (self.scale[1:], corner[None], 1.0 + self.judged[None])
+        return torch.cat((self.prior_scale.flatten(), self.white_scale.flatten(), *of_pixels))
 
     def _rescale_noise(self, values: dict[str, Tensor], evidence: PoseEvidence) -> bool:
         """Finds the noise of poses from frame to frame; returns whether it has come to rest."""

@@ -37,17 +37,10 @@ class PoseEvidence:
 
 
 def pose_evidence(
-    prior: PosePrior,
-    equations: MapEquations,
-    scale: Float[Tensor, "j _"],
-    told: Float[Tensor, "j k"] | None = None,
+    prior: PosePrior, equations: MapEquations, scale: Float[Tensor, "j _"]
 ) -> PoseEvidence:
-    """That at the point of normal equations, which have been solved, with the prior's scales that they were made with.
-
-    What is `told` of changes is kept where it is known already.
-    """
-    if told is None:
-        told = share_of_changes_told(prior, equations, scale)
+    """That at the point of normal equations, which have been solved, with the prior's scales that they were made with."""
+    told = share_of_changes_told(prior, equations, scale)
     return PoseEvidence(told, equations.variance_of_leaves())
 
 

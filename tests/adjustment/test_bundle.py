@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.mapper import MapResult, build_bundle
@@ -55,6 +56,23 @@ def test_a_bundle_that_was_loaded_has_the_matches_and_scales_of_the_other(
     saved.refresh()
     loaded.refresh()
     assert costs(loaded) == costs(saved)
+
+
+def test_what_is_known_of_poses_is_found_anew_when_scales_or_judgements_have_changed(
+    build: Callable[[], Bundle],
+):
+    bundle = build()
+    state = adjust.start(bundle)
+    assert bundle.evidence() is None
+    for _ in adjust.steps(bundle, state):
+        if bundle.evidence() is not None:
+            break
+    kept = bundle.evidence()
+    assert kept is not None and bool((kept.left > 0).all())
+    for change in (lambda: bundle.prior_scale[1, 0].mul_(1.05), lambda: bundle.judged.add_(1)):
+        change()
+        assert bundle.evidence() is None
+        bundle.told_at.copy_(bundle._scales())
 
 
 def test_the_papers_cost_weighs_every_corner_and_lane_point_by_itself_and_all_pixels_alike(
