@@ -6,7 +6,12 @@ are not. With A of the chains, E between them and the joints, Q of the joints,
     [ A    E ]^-1                                                      U = A^-1 E
     [ E^T  Q ]    has the chains' part  A^-1 + U M^-1 U^T              M = Q - E^T U
 
-and M is a small matrix for every drive.
+and M is block tridiagonal, as a chain lies between two joints. With its blocks D_k and, towards the next one, F_k the
+blocks of the inverse Z follow from each other,
+
+    S_k = D_k - F_k-1^T G_k-1        G_k = S_k^-1 F_k        Z_kk = S_k^-1 + G_k Z_k+1,k+1 G_k^T        Z_kj = -G_k Z_k+1,j
+
+so that time and memory grow with the number of joints.
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.solvers.block_elimination import Lead
@@ -27,6 +32,52 @@ from crowdmap_torch.processes.threads import in_order
 
 
 @dataclass(frozen=True)
+class JointChain:
+    """The covariance of joints along their drives, everything else known."""
+
+    own: Float[Tensor, "joints w w"]
+    """Of each joint, Z_kk."""
+    towards: Float[Tensor, "joints w w"]
+    """-G_k: takes the covariance of the next one with any further on to that of this one; zero where none is next."""
+
+    @classmethod
+    def of(
+        cls,
+        diagonal: Float[Tensor, "joints w w"],
+        link: Float[Tensor, "joints w w"],
+        follows: Bool[Tensor, " joints"],
+    ) -> JointChain:
+        """That of D and F; which joints follow the one before in its drive."""
+        begins = torch.nonzero(~follows)[:, 0]
+        count = torch.cat((begins, begins.new_tensor([len(follows)]))).diff()
+        towards, own = torch.zeros_like(link), torch.empty_like(diagonal)
+        left = diagonal.clone()
+        # All drives side by side, joint after joint.
+        for step in range(int(count.max()) - 1):
+            k = begins[count > step + 1] + step
+            towards[k] = -torch.linalg.solve(left[k], link[k])
+            left[k + 1] += link[k].mT @ towards[k]
+        alone = torch.linalg.inv(left)
+        for step in reversed(range(int(count.max()))):
+            k = begins[count > step] + step
+            # The last one of each drive has none behind it.
+            behind = torch.where((count > step + 1)[count > step], k + 1, k)
+            G = towards[k]
+            beyond = own[behind].where((behind > k)[:, None, None], 0.0)
+            own[k] = alone[k] + G @ beyond @ G.mT
+        return cls(own, towards)
+
+    def between(self, joint: Int[Tensor, " m"], other: Int[Tensor, " m"]) -> Float[Tensor, "m w w"]:
+        """The covariance of joints with others of their drive."""
+        first, last = torch.minimum(joint, other), torch.maximum(joint, other)
+        found, steps = self.own[last], last - first
+        for step in range(1, int(steps.max()) + 1 if len(steps) else 1):
+            going = torch.nonzero(steps >= step)[:, 0]
+            found[going] = self.towards[last[going] - step] @ found[going]
+        return torch.where((joint <= other)[:, None, None], found, found.mT)
+
+
+@dataclass(frozen=True)
 class Joints:
     """What the joints of drives add to the covariances of their chains, everything else known."""
 
@@ -34,17 +85,15 @@ class Joints:
     """U: how each eliminated block goes with its chain's two joints, one behind the other."""
     owner: Int[Tensor, " e"]
     """Chain of each eliminated block."""
-    drive: Int[Tensor, " chains"]
-    """Drive of each chain, of those that are joined."""
-    entry: Int[Tensor, "chains q"]
-    """Where in its drive the chain's joints are."""
-    covariance: Float[Tensor, "d n n"]
-    """M^-1, by drive."""
+    joint: Int[Tensor, "chains 2"]
+    """The joints of each chain; of one that has one alone that one twice."""
+    covariance: JointChain
 
     def of_blocks(self, block: Int[Tensor, " m"]) -> Float[Tensor, "m k k"]:
         """What they add to the covariance of eliminated blocks."""
-        U = self.goes_with[block]
-        return U @ self._between(self.owner[block], self.owner[block]) @ U.mT
+        U, own = self.goes_with[block], self.owner[block]
+        chain, number = torch.unique(own, return_inverse=True)
+        return U @ self._between(chain, chain)[number] @ U.mT
 
     def of_changes(self, changes: ChainChanges, first_block: int) -> Float[Tensor, "q m"]:
         """What they add to the variances of changes; chains' blocks are counted from `first_block` on."""
@@ -64,9 +113,12 @@ class Joints:
         self, chain: Int[Tensor, " m"], other: Int[Tensor, " m"]
     ) -> Float[Tensor, "m q q"]:
         """The covariance of chains' joints with those of others of their drive."""
-        # A drive's matrix is not copied once for each chain's row: drives have many joints and many rows.
-        row, column = self.entry[chain][:, :, None], self.entry[other][:, None]
-        return self.covariance[self.drive[chain][:, None, None], row, column]
+        here, there = self.joint[chain], self.joint[other]
+        rows = [
+            torch.cat([self.covariance.between(here[:, i], there[:, j]) for j in range(2)], dim=2)
+            for i in range(2)
+        ]
+        return torch.cat(rows, dim=1)
 
 
 def joints_of(
@@ -104,25 +156,20 @@ def joints_of(
     ):
         goes_with[part.block] = U
         taken += own
-    known, joint = plan.joint >= 0, plan.joint.clamp_min(0)
+    known = plan.joint >= 0
+    # Of a chain that has none of its own, or one, nothing goes with the others that stand here.
+    joint = torch.where(known, plan.joint, plan.joint.amax(1, keepdim=True)).clamp_min(0)
     # Joints that one chain lies between are of one drive.
+    inner = torch.nonzero(known.all(1))[:, 0]
     follows = torch.zeros(count, dtype=torch.bool, device=at.device)
-    follows[joint[known.all(1), 1]] = True
-    drive = (~follows).cumsum(0) - 1
-    begins = torch.nonzero(~follows)[:, 0]
-    place = torch.arange(count, device=at.device) - begins[drive]
-    most, drives = int(place.max()) + 1, len(begins)
-    M = torch.eye(most * width).to(like).repeat(drives, 1, 1)
-    inner = torch.arange(width, device=at.device)
-    own = place[:, None] * width + inner
-    M[drive[:, None, None], own[:, :, None], own[:, None]] = hessian.read(
-        at[:, :, None], at[:, None]
-    )
-    entry = own[joint].flatten(1)
-    of_chain = drive[joint.amax(1)]
-    area = (of_chain[:, None, None] * most * width + entry[:, :, None]) * most * width
-    M.view(-1).index_add_(0, (area + entry[:, None]).flatten(), -taken.flatten())
-    return Joints(goes_with, structure.owner, of_chain, entry, torch.linalg.inv(M))
+    follows[joint[inner, 1]] = True
+    diagonal = hessian.read(at[:, :, None], at[:, None])
+    for end in range(2):
+        own, side = torch.nonzero(known[:, end])[:, 0], slice(end * width, (end + 1) * width)
+        diagonal.index_add_(0, joint[own, end], -taken[own, side, side])
+    link = torch.zeros_like(diagonal)
+    link[joint[inner, 0]] = -taken[inner, :width, width:]
+    return Joints(goes_with, structure.owner, joint, JointChain.of(diagonal, link, follows))
 
 
 def _towards_joints(

@@ -4,51 +4,74 @@ from __future__ import annotations
 
 import torch
 
-from crowdmap_torch.optim.solvers.joints import Joints
+from crowdmap_torch.optim.solvers.joints import JointChain, Joints
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 
 
-def joined(chains: int, blocks: int, width: int = 2) -> Joints:
-    """One drive of chains between joints, and as many blocks, chain by chain."""
+def joined(chains: int, blocks: int, width: int = 2) -> tuple[Joints, torch.Tensor, torch.Tensor]:
+    """Two drives of chains between joints, and as many blocks of each, chain by chain; D and F of the joints."""
     make = torch.Generator().manual_seed(7)
-    size = (chains + 1) * width
-    root = torch.randn(size, size, dtype=torch.double, generator=make)
-    covariance = root @ root.T / size + torch.eye(size)
-    first = torch.arange(chains)[:, None] * width
-    return Joints(
-        goes_with=torch.randn(blocks, 3, 2 * width, dtype=torch.double, generator=make),
-        owner=torch.arange(blocks) * chains // blocks,
-        drive=torch.zeros(chains, dtype=torch.long),
-        entry=first + torch.arange(2 * width),
-        covariance=covariance[None],
+
+    def noise(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, dtype=torch.double, generator=make)
+
+    count = 2 * (chains + 1)
+    follows = torch.arange(count) % (chains + 1) != 0
+    link = 0.3 * noise(count, width, width)
+    link[torch.arange(count) % (chains + 1) == chains] = 0
+    root = noise(count, width, width)
+    diagonal = root @ root.mT + 5 * torch.eye(width)
+    first = torch.arange(2 * chains) + (torch.arange(2 * chains) >= chains)
+    joints = Joints(
+        goes_with=noise(2 * blocks, 3, 2 * width),
+        owner=torch.arange(2 * blocks) * chains // blocks,
+        joint=torch.stack((first, first + 1), dim=1),
+        covariance=JointChain.of(diagonal, link, follows),
     )
+    return joints, diagonal, link
 
 
-def between(joints: Joints, one: int, other: int) -> torch.Tensor:
-    rows, columns = joints.entry[joints.owner[one]], joints.entry[joints.owner[other]]
-    return joints.covariance[0][rows][:, columns]
+def between(
+    joints: Joints, diagonal: torch.Tensor, link: torch.Tensor, one: int, other: int
+) -> torch.Tensor:
+    """Of the inverse of the whole matrix."""
+    count, width = len(diagonal), diagonal.shape[1]
+    whole = torch.block_diag(*diagonal)
+    for k in range(count - 1):
+        here, there = slice(k * width, (k + 1) * width), slice((k + 1) * width, (k + 2) * width)
+        whole[here, there], whole[there, here] = link[k], link[k].T
+    rows, columns = (
+        (joints.joint[joints.owner[at]][:, None] * width + torch.arange(width)).flatten()
+        for at in (one, other)
+    )
+    return torch.linalg.inv(whole)[rows][:, columns]
 
 
 def test_blocks_and_changes_are_those_of_their_chains_joints():
-    joints = joined(chains=4, blocks=12)
-    found = joints.of_blocks(torch.arange(12))
+    joints, diagonal, link = joined(chains=4, blocks=12)
+    found = joints.of_blocks(torch.arange(24))
     for k, U in enumerate(joints.goes_with):
-        assert torch.allclose(found[k], U @ between(joints, k, k) @ U.T, rtol=1e-12, atol=1e-12)
-    pair = torch.tensor([[0, 11], [5, 6]])
+        expected = U @ between(joints, diagonal, link, k, k) @ U.T
+        assert torch.allclose(found[k], expected, rtol=1e-12, atol=1e-12)
+    pair = torch.tensor([[0, 11], [5, 6], [23, 12], [14, 15]])
     of = torch.eye(3, dtype=torch.double)[:, :2]
-    changes = ChainChanges(pair=pair, of=of, column=torch.zeros(2, dtype=torch.long))
+    changes = ChainChanges(pair=pair, of=of, column=torch.zeros(4, dtype=torch.long))
     found = joints.of_changes(changes, 0)
     for row, (a, b) in enumerate(pair.tolist()):
         u, v = joints.goes_with[a].T @ of, joints.goes_with[b].T @ of
         both = torch.cat((-u, v))
-        upper = torch.cat((between(joints, a, a), between(joints, a, b)), dim=1)
-        lower = torch.cat((between(joints, b, a), between(joints, b, b)), dim=1)
+        upper = torch.cat(
+            (between(joints, diagonal, link, a, a), between(joints, diagonal, link, a, b)), dim=1
+        )
+        lower = torch.cat(
+            (between(joints, diagonal, link, b, a), between(joints, diagonal, link, b, b)), dim=1
+        )
         whole = both.T @ torch.cat((upper, lower)) @ both
         assert torch.allclose(found[row], whole.diagonal(), rtol=1e-12, atol=1e-12)
 
 
 def test_a_drive_of_many_joints_and_blocks_takes_the_memory_of_its_blocks():
     """A copy of the drive's matrix for every block would be 1.3 TB."""
-    joints = joined(chains=1000, blocks=40_000)
+    joints, *_ = joined(chains=1000, blocks=40_000)
     found = joints.of_blocks(torch.arange(40_000))
     assert found.shape == (40_000, 3, 3) and bool((found.diagonal(dim1=1, dim2=2) > 0).all())
