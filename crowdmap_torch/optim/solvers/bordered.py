@@ -121,8 +121,9 @@ class BorderedNormalEquations:
         delta = {**inner.unpack(x, y), **self.layout.unpack(z[None])}
         parts = inner.step_parts(x, y, added_x, added_y)
         last = (StepPart.alone(y, right_side), StepPart.alone(z, self.gradient - reduced.gradient))
+        count = inner.structure.where.used.sum(1).to(z) + len(z)
         border = StepPart(z[None], self.gradient[None], added[None])
-        return solved_step(delta, *parts, border, last=last)
+        return solved_step(delta, *parts, border, last=last, count=count)
 
     def _failed(self) -> Step:
         inner, nothing = self.inner, torch.zeros_like(self.gradient)
@@ -162,8 +163,10 @@ class BorderedNormalEquations:
         def through(of: tuple[Part, tuple[Lead, ...], str]) -> tuple[Through, Float[Tensor, "j c"]]:
             part, leads, name = of
             block, chain = part.block, owner[part.block]
-            columns = border[name][chain], len(self.layout.offset[name])
-            found = self._through(part, leads, self.link[block][..., own[name]], *columns)
+            seen, column = torch.unique(border[name][chain], return_inverse=True)
+            right_side = self.link[block][..., own[name]]
+            found = self._through(part, leads, right_side, column, len(seen))
+            found = replace(found, border=seen)
             told = (found.x.mT @ inner.eliminated_gradient[block][..., None])[..., 0]
             by_chain = told.new_zeros(len(entry), told.shape[1]).index_add_(0, chain, told)
             return replace(found, x=found.x[:0]), by_chain
@@ -179,7 +182,9 @@ class BorderedNormalEquations:
         for (*_, name), (found, told) in zip(
             every, in_order(through, every, T.device, worth=1), strict=True
         ):
-            coupled[name] += found.by_landmark
+            wide = self.layout.tangent_dim[name]
+            by_block = found.by_landmark.unflatten(1, (-1, wide))
+            coupled[name].unflatten(1, (-1, wide)).index_add_(1, found.border, by_block)
             at = entry[:, :, None] * size + entry[:, None, own[name]]
             T.view(-1).index_add_(0, at.flatten(), -found.by_chain.flatten())
             gradient.index_add_(0, entry[:, own[name]].flatten(), told.flatten())
@@ -207,7 +212,8 @@ class BorderedNormalEquations:
         x = part.solve(leads, right_side)
         by_chain = x.new_zeros(structure.plan.chain_count, self.link.shape[-1], x.shape[-1])
         by_chain.index_add_(0, structure.owner[part.block], self.link[part.block].mT @ x)
-        return Through(x, self.inner.couple(part, x, column, columns).flatten(1), by_chain)
+        by_landmark = self.inner.couple(part, x, column, columns).flatten(1)
+        return Through(x, by_landmark, by_chain, torch.arange(columns, device=x.device))
 
 
 @dataclass(frozen=True)
@@ -220,6 +226,8 @@ class Through:
     """B x, column by column."""
     by_chain: Float[Tensor, "j b c"]
     """F^T x, chain by chain."""
+    border: Int[Tensor, " blocks"]
+    """The blocks of the border that the columns are of."""
 
 
 @dataclass(frozen=True)
