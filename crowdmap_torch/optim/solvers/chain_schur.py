@@ -192,7 +192,8 @@ class ChainNormalEquations:
         y = -self.solve_reduced(right_side[:, None])[:, 0]
         x = self.substitute(y, self.eliminated_gradient)
         parts = self.step_parts(x, y, added_x, added_y)
-        return solved_step(self.unpack(x, y), *parts, last=(StepPart.alone(y, right_side),))
+        last, count = (StepPart.alone(y, right_side),), self.structure.where.used.sum(1).to(y)
+        return solved_step(self.unpack(x, y), *parts, last=last, count=count)
 
     def damped_by(
         self, damping: Float[Tensor, " 1"]

@@ -166,6 +166,9 @@ class ReducibleSums(ChainSums):
         for name, offset in where.offset.items():
             square = self.by_variable.hessian(name).permute(1, 2, 0)
             self._matrix.add(offset, offset, square)
+        # What is nobody's column stands for itself.
+        gap = torch.nonzero(~where.used[0])[:, 0]
+        self._matrix.add(gap, gap, self._matrix.flat.new_ones(1, 1, len(gap)))
         return self._matrix
 
     def border_hessian(self) -> Float[Tensor, "z z"]:

@@ -29,7 +29,7 @@ from crowdmap_torch.optim.solvers.dissection import dissected, incidence, near_e
 from crowdmap_torch.optim.solvers.layout import Layout, layout
 from crowdmap_torch.optim.solvers.parts import Part, PartBuilder, parts_of_chains
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
-from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern
+from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern, tile_width
 from crowdmap_torch.optim.solvers.tile_patterns import (
     binds,
     direct_pattern,
@@ -148,10 +148,13 @@ def analyse(
         pairs = landmark_pairs(problem, before.landmarks, plan.first_block)
         if binds(before.direct, before.landmarks, pairs):
             return before.with_couplings(couplings)
-    pairs, rank = landmark_pairs(problem, landmarks, plan.first_block), plan.rank
+    pairs = landmark_pairs(problem, landmarks, plan.first_block)
+    rank, section = plan.rank, plan.section
     if rank is None:
-        rank = _rank(keys, pairs, plan.owner, landmarks)
-    where = where.in_order(torch.argsort(rank[: len(landmarks.column)], stable=True))
+        rank, section = _rank(keys, pairs, plan.owner, landmarks)
+    order = torch.argsort(rank[: len(landmarks.column)], stable=True)
+    grid = tile_width(where.dim, order.device)
+    where = where.in_order(order, None if section is None else section[order], grid)
     landmarks = LandmarkBlocks.of(where, plan.chain.device)
     owner = plan.owner
     k = problem.variables[plan.chains].tangent_dim
@@ -274,11 +277,9 @@ def planned_ahead(
             goes &= of[there.clamp(0, len(of) - 1)] == of[here]
             room.append(keys[own[goes]] + step)
     every = torch.unique(torch.cat(room))
+    rank, section = _rank(every, pairs, plan.owner, landmarks)
     return replace(
-        plan,
-        rank=_rank(every, pairs, plan.owner, landmarks),
-        room=every,
-        part=parts_of_chains(keys, plan, count),
+        plan, rank=rank, section=section, room=every, part=parts_of_chains(keys, plan, count)
     )
 
 
@@ -301,28 +302,34 @@ def _rank(
     pairs: Int[Tensor, "n 2"],
     owner: Int[Tensor, " e"],
     landmarks: LandmarkBlocks,
-) -> Float[Tensor, " q"]:
-    """A position of every landmark on a line, by couplings as keys and pairs that are bound without an eliminated block."""
+) -> tuple[Float[Tensor, " q"], Int[Tensor, " q"] | None]:
+    """A position of every landmark on a line, by couplings as keys and pairs that are bound without an eliminated block.
+
+    With the section of the line that each is in, where it is worth to begin sections with tiles.
+    """
     count = landmarks.count
     block, landmark = keys // count, torch.cat((keys % count, pairs.flatten()))
     # Blocks of a chain are coupled to nearly what their neighbours are: a few of them together tell the same.
     by_few = incidence((block // 8).cpu().numpy(), (keys % count).cpu().numpy(), count)
     if not len(landmarks.width):
-        return torch.zeros(count, dtype=torch.double, device=keys.device)
+        return torch.zeros(count, dtype=torch.double, device=keys.device), None
     # Once it is eliminated, a chain has bound all that it was coupled to.
     first = int(owner.max()) + 1 if len(owner) else 0
     apart = torch.arange(first, first + len(pairs), device=keys.device).repeat_interleave(2)
     by = torch.cat((owner[block], apart))
     bound = incidence(by.cpu().numpy(), landmark.cpu().numpy(), count)
     # In a city by dissection; along one road a band may be sparser, though its windows have more runs.
-    nested, banded = (
+    nested, section, banded = (
         torch.from_numpy(found).to(keys.device)
         for found in (
-            dissected(bound, landmarks.width.cpu().numpy(), near_each_other(by_few)),
+            *dissected(bound, landmarks.width.cpu().numpy(), near_each_other(by_few)),
             near_each_other(bound),
         )
     )
-    of_nested, of_banded = (
-        tiles_of_factor(by, landmark, landmarks, position) for position in (nested, banded)
-    )
-    return (banded if of_banded < _SPARSER * of_nested else nested).double()
+    # Tiles of a GPU are too wide to begin them anew.
+    begun = section if keys.device.type == "cpu" else None
+    of_nested = tiles_of_factor(by, landmark, landmarks, nested, begun)
+    of_banded = tiles_of_factor(by, landmark, landmarks, banded)
+    if of_banded < _SPARSER * of_nested:
+        return banded.double(), None
+    return nested.double(), begun

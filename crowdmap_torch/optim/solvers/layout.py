@@ -24,20 +24,26 @@ class Layout:
     used: Bool[Tensor, "groups dim"]
     """False for the padding of groups with fewer unknowns than the largest."""
 
-    def in_order(self, block: Int[Tensor, " q"]) -> Layout:
-        """The same for one problem, the blocks of all variables, numbered behind each other, in this order."""
-        device = block.device
+    def in_order(
+        self, block: Int[Tensor, " q"], section: Int[Tensor, " q"] | None = None, grid: int = 1
+    ) -> Layout:
+        """The same for one problem, the blocks of all variables, numbered behind each other, in this order.
+
+        Each block's `section`, in this order, begins at a multiple of `grid`, with gaps before it; None: there is one.
+        """
         width = torch.cat(
             [
-                torch.full((len(at),), self.tangent_dim[name], device=device)
+                torch.full((len(at),), self.tangent_dim[name], device=block.device)
                 for name, at in self.offset.items()
             ]
             or [block]
         )
+        placed, used = in_sections(width[block], section, grid)
         begins = torch.empty_like(block)
-        begins[block] = width[block].cumsum(0) - width[block]
+        begins[block] = placed
         sizes = [len(at) for at in self.offset.values()]
-        return replace(self, offset=dict(zip(self.offset, begins.split(sizes), strict=True)))
+        offset = dict(zip(self.offset, begins.split(sizes), strict=True))
+        return replace(self, offset=offset, dim=len(used), used=used[None])
 
     def entries(self, name: str, block: Int[Tensor, " m"] | slice) -> Int[Tensor, "m k"]:
         """Where the tangents of blocks of a variable lie."""
@@ -59,6 +65,25 @@ class Layout:
         for name in self.offset:
             packed[self.group[name][:, None], self.entries(name, slice(None))] = tangents[name]
         return packed
+
+
+def in_sections(
+    width: Int[Tensor, " q"], section: Int[Tensor, " q"] | None, grid: int
+) -> tuple[Int[Tensor, " q"], Bool[Tensor, " dim"]]:
+    """Where blocks of these widths begin, section by section, each at a multiple of `grid`; and which columns are theirs."""
+    begins = width.cumsum(0) - width
+    if section is not None and len(section):
+        _, of, count = torch.unique_consecutive(section, return_inverse=True, return_counts=True)
+        size = torch.zeros_like(count).index_add_(0, of, width)
+        room = -(-size // grid) * grid
+        room[-1] = size[-1]
+        begins = begins + ((room - size).cumsum(0) - (room - size))[of]
+    dim = int(begins[-1] + width[-1]) if len(width) else 0
+    used = torch.zeros(dim, dtype=torch.bool, device=width.device)
+    inner = torch.arange(int(width.sum()), device=width.device)
+    inner -= torch.repeat_interleave(width.cumsum(0) - width, width)
+    used[torch.repeat_interleave(begins, width) + inner] = True
+    return begins, used
 
 
 def layout(problem: Problem, values: Values, *, skip: tuple[str, ...] = ()) -> Layout:

@@ -35,6 +35,9 @@ class EliminationPlan:
     """The block that each chain begins at and the one that it ends at; -1: it does not."""
     rank: Float[Tensor, " q"] | None = None
     """A position of every landmark on a line (`planned_ahead`); None: found whenever rows touch other landmarks."""
+    section: Int[Tensor, " q"] | None = None
+    """Section of that line that each landmark is in, one behind the other: the landmarks' matrix has tiles that begin with
+    them (`planned_ahead`). None: there is one."""
     room: Int[Tensor, " keys"] | None = None
     """What eliminated blocks may be coupled to (`planned_ahead`): the order of elimination is kept while they are coupled to
     nothing else. None: it is found whenever they are coupled to others."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 _ONE_TILE = 768
 """Unknowns up to which one tile holds everything."""
-_WIDTH = 160
+_WIDTH = 96
 """Of tiles on a processor: what fits its cache, and no more zeros than need be."""
 _WIDTH_CUDA = 1024
 """Of tiles on a GPU, where a call costs as much as the arithmetic of a small one."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem
 from crowdmap_torch.optim.solvers.dissection import incidence
+from crowdmap_torch.optim.solvers.layout import in_sections
 from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern, tile_width
 from crowdmap_torch.optim.solvers.windows import LandmarkBlocks
 
@@ -73,14 +74,22 @@ def tiles_of_factor(
     landmark: Int[Tensor, " n"],
     landmarks: LandmarkBlocks,
     position: Int[Tensor, " q"],
+    section: Int[Tensor, " q"] | None = None,
 ) -> int:
-    """How many tiles the factor has where landmarks have these positions, each bound to all that are bound `by` the same."""
-    order = torch.argsort(position)
+    """How many tiles the factor has where landmarks have these positions, each bound to all that are bound `by` the same.
+
+    A `section` of them begins at a border of tiles.
+    """
+    order, device = torch.argsort(position), position.device
+    width = tile_width(landmarks.dim, device)
+    begins, used = in_sections(
+        landmarks.width[order], None if section is None else section[order], width
+    )
     column = torch.empty_like(order)
-    column[order] = landmarks.width[order].cumsum(0) - landmarks.width[order]
-    placed, width = replace(landmarks, column=column), tile_width(landmarks.dim, column.device)
+    column[order] = begins
+    placed = replace(landmarks, column=column, dim=len(used))
     present = _bound(by, landmark, placed, width)
-    return TilePattern.of(landmarks.dim, width, present, column.device).filled().count
+    return TilePattern.of(placed.dim, width, present, device).filled().count
 
 
 def _pairs(blocks: list[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:

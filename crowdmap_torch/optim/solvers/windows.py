@@ -96,7 +96,7 @@ class LandmarkBlocks:
     position: Int[Tensor, " q"]
     """Where in that order each is."""
     of_column: Int[Tensor, " dim"]
-    """The block of every column."""
+    """The block of every column; that before it of a column that is nobody's."""
 
     @classmethod
     def of(cls, where: Layout, device: torch.device) -> LandmarkBlocks:
@@ -110,6 +110,7 @@ class LandmarkBlocks:
         none = torch.zeros(0, dtype=torch.long, device=device)
         column, width = torch.cat([none, *columns]), torch.cat([none, *widths])
         ordered = torch.argsort(column)
+        begins = torch.cat((column[ordered], torch.full((1,), where.dim, device=device)))
         return cls(
             first=first,
             column=column,
@@ -118,7 +119,7 @@ class LandmarkBlocks:
             dim=where.dim,
             ordered=ordered,
             position=torch.argsort(ordered),
-            of_column=torch.repeat_interleave(ordered, width[ordered]),
+            of_column=torch.repeat_interleave(ordered, begins.diff()),
         )
 
     def columns(self, landmark: Int[Tensor, "f q"], widths: Sequence[int]) -> Int[Tensor, "f w"]:
