@@ -13,6 +13,7 @@ the poses' errors is in it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -114,9 +115,7 @@ def fit_vanishing(
         weight = loss.weight(whitened / scale**2) / variance * used
         # Columns: alpha, psi, kappa, kappa'; then what a curved and a twisted road would add to
         # alpha.
-        J = torch.stack(
-            (by_y, -torch.ones_like(Z), -Z / 2, -(Z**2) / 6, by_y * Z / 2, by_y * x * Z), dim=-1
-        )
+        J = (by_y, -torch.ones_like(Z), -Z / 2, -(Z**2) / 6, by_y * Z / 2, by_y * x * Z)
         by_offset = -(y + a)
         A, B, C, shared_rhs, offset_rhs = _normal_equations(
             J, by_offset, residual, weight, detection, rays.frame, count, rays.frames
@@ -157,7 +156,7 @@ def _first_offsets(rays: LaneRays, alpha: Float[Tensor, " f"]) -> Float[Tensor, 
 
 
 def _normal_equations(
-    J: Float[Tensor, "p 6"],
+    J: Sequence[Float[Tensor, " p"]],
     by_offset: Float[Tensor, " p"],
     residual: Float[Tensor, " p"],
     weight: Float[Tensor, " p"],
@@ -166,16 +165,16 @@ def _normal_equations(
     count: int,
     frames: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blocks of J^T W J, shared [f 6 6], mixed [d 6] and own [d], and the parts of -J^T W r."""
-    J = torch.cat((J, by_offset[:, None], residual[:, None]), dim=-1)
-    size = J.shape[-1]
-    i, j = torch.triu_indices(size, size, device=J.device)
-    products = (weight[:, None] * J)[:, i] * J[:, j]
-    # Of the symmetric matrices only one half is summed up.
-    half = products.new_zeros(count, len(i)).index_add(0, detection, products)
-    own = half.new_zeros(count, size, size)
-    own[:, i, j] = half
-    own[:, j, i] = half
+    """Blocks of J^T W J, shared [f 6 6], mixed [d 6] and own [d], and the parts of -J^T W r; J by its columns."""
+    columns = (*J, by_offset, residual)
+    size = len(columns)
+    own = residual.new_zeros(size, size, count)
+    # Of the symmetric matrices one half is summed up, number by number: products of all at once take three times as long.
+    for i, pulling in enumerate(weight * column for column in columns):
+        for j in range(i, size):
+            own[i, j].index_add_(0, detection, pulling * columns[j])
+            own[j, i] = own[i, j]
+    own = own.permute(2, 0, 1).contiguous()
     k = size - 2
     A = own.new_zeros(frames, k, k).index_add(0, frame, own[:, :k, :k])
     rhs = own.new_zeros(frames, k).index_add(0, frame, -own[:, :k, k + 1])
