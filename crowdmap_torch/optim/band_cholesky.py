@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.linalg import LinAlgError
 from scipy.linalg import cho_solve_banded as lapack_solve
 from scipy.linalg import cholesky_banded as lapack_factor
@@ -30,9 +30,62 @@ class BandFactor(Protocol):
         """Of A."""
         ...
 
+    @property
+    def band(self) -> Float[Tensor, "q w"]:
+        """L column by column, the diagonal first: `L[j + d, j] = band[j, d]`."""
+        ...
+
     def solve(self, right: Float[Tensor, "q c"]) -> Float[Tensor, "q c"]:
         """A^-1 times `right`."""
         ...
+
+
+@dataclass(frozen=True)
+class BandInverse:
+    """The inverse of a banded matrix near its diagonal: blocks on it, and those beside them."""
+
+    own: Float[Tensor, "k b b"]
+    beside: Float[Tensor, "k b b"]
+    """Right of each of them."""
+
+    @classmethod
+    def of(cls, factor: BandFactor, reach: int) -> BandInverse:
+        """That of a matrix with this factor, as far as `reach` from the diagonal at least.
+
+        With A = L L^T in blocks, from the last one to the first (Takahashi, Fagan and Chen 1973),
+
+            Z_k,k+1 = -G_k^T Z_k+1,k+1        Z_kk = (L_kk L_kk^T)^-1 - Z_k,k+1 G_k        G_k = L_k+1,k L_kk^-1
+        """
+        band = factor.band
+        q, w = band.shape
+        b = max(_LEAST_BLOCK, w - 1, reach)
+        count, device = -(-q // b), band.device
+        own, beside = band.new_zeros(count, b, b), band.new_zeros(count, b, b)
+        eye = torch.eye(b).to(band)
+        row, column = torch.arange(2 * b, device=device)[:, None], torch.arange(b, device=device)
+        back = row - column
+        for k in reversed(range(count)):
+            at = k * b + column
+            inside = (back >= 0) & (back < w) & (k * b + row < q)
+            found = band[at.clamp_max(q - 1), back.clamp(0, w - 1)].where(inside, 0.0)
+            # Behind the last unknown each stands for itself.
+            diagonal = found[:b] + torch.diag((at >= q).to(band))
+            inverse = torch.linalg.solve_triangular(diagonal, eye, upper=False)
+            torch.mm(inverse.mT, inverse, out=own[k])
+            if k + 1 < count:
+                G = found[b:] @ inverse
+                torch.mm(G.mT, own[k + 1], out=beside[k]).neg_()
+                own[k] -= beside[k] @ G
+        return cls(own, beside)
+
+    def read(self, row: Int[Tensor, ...], column: Int[Tensor, ...]) -> Float[Tensor, ...]:
+        """Entries, rows and columns broadcast, no further from the diagonal than was asked for."""
+        b = self.own.shape[1]
+        first, last = torch.minimum(row, column), torch.maximum(row, column)
+        k, behind = first // b, last // b
+        at = first * b + last - behind * b
+        same = (k == behind).expand_as(at)
+        return torch.where(same, self.own.flatten()[at], self.beside.flatten()[at])
 
 
 def cholesky_banded(lower: Float[Tensor, "q w"]) -> BandFactor | None:
@@ -51,6 +104,10 @@ class _LapackFactor:
     @property
     def log_determinant(self) -> Float[Tensor, ""]:
         return self.like.new_tensor(2 * float(np.log(self.factor[0]).sum()))
+
+    @property
+    def band(self) -> Float[Tensor, "q w"]:
+        return torch.from_numpy(self.factor).T
 
     def solve(self, right: Float[Tensor, "q c"]) -> Float[Tensor, "q c"]:
         solved = lapack_solve((self.factor, True), right.numpy(), check_finite=False)
@@ -75,10 +132,22 @@ class _BlockFactor:
     """Under each of them, as far as the band goes."""
     size: int
     """Unknowns; the last block may have more."""
+    width: int
+    """Of the band."""
 
     @property
     def log_determinant(self) -> Float[Tensor, ""]:
         return 2 * self.block.diagonal(dim1=-2, dim2=-1).log().sum()
+
+    @property
+    def band(self) -> Float[Tensor, "q w"]:
+        (_, b, _), device = self.block.shape, self.block.device
+        column = torch.arange(self.size, device=device)[:, None]
+        k, j = column // b, column % b
+        row = j + torch.arange(self.width, device=device)
+        whole = torch.cat((self.block, self.below), dim=1)
+        inside = (row < whole.shape[1]) & (column - j + row < self.size)
+        return whole[k, row.clamp_max(whole.shape[1] - 1), j].where(inside, 0.0)
 
     def solve(self, right: Float[Tensor, "q c"]) -> Float[Tensor, "q c"]:
         (count, b, _), reach = self.block.shape, self.below.shape[1]
@@ -118,4 +187,4 @@ def _by_blocks(lower: Float[Tensor, "q w"]) -> _BlockFactor | None:
         for s in range(min(reach // b, count - 1 - n)):
             beyond = slice(s * b, s * b + b)
             window[n + 1 + s, : reach - s * b] -= update[s * b :, beyond]
-    return None if bool(failed.any()) else _BlockFactor(block, below, q)
+    return None if bool(failed.any()) else _BlockFactor(block, below, q, w)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from crowdmap_torch.optim.band_cholesky import _by_blocks, _by_lapack
+from crowdmap_torch.optim.band_cholesky import BandInverse, _by_blocks, _by_lapack
 
 F64 = torch.float64
 WAYS = {"lapack": _by_lapack, "blocks": _by_blocks}
@@ -33,6 +33,20 @@ def test_solutions_and_determinant_are_those_of_the_dense_matrix(
     assert factor is not None
     torch.testing.assert_close(factor.solve(right), torch.linalg.solve(dense, right))
     torch.testing.assert_close(factor.log_determinant, dense.logdet())
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(("q", "w", "reach"), [(1, 1, 0), (7, 3, 5), (100, 40, 0), (211, 20, 90)])
+def test_the_inverse_near_the_diagonal_is_that_of_the_dense_matrix(
+    way: str, q: int, w: int, reach: int, generator: torch.Generator
+) -> None:
+    dense, lower = banded(q, w, generator)
+    factor = WAYS[way](lower.clone())
+    assert factor is not None
+    row, column = torch.meshgrid(torch.arange(q), torch.arange(q), indexing="ij")
+    near = (row - column).abs() <= max(w - 1, reach)
+    found = BandInverse.of(factor, reach).read(row[near], column[near])
+    torch.testing.assert_close(found, torch.linalg.inv(dense)[near])
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.band_cholesky import BandFactor, cholesky_banded
+from crowdmap_torch.optim.band_cholesky import BandFactor, BandInverse, cholesky_banded
 from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, TermRows, add_blocks, assemble
@@ -36,8 +36,6 @@ UNHELD_FLOOR = 1e-6
 """Information added to every unknown before its covariance is read: none is less sure than 1000 units."""
 _LANDMARKS_AT_ONCE = 32
 """Landmarks whose products are taken off the path at once."""
-COLUMNS_AT_ONCE = 256
-"""Right-hand sides of a banded system that are solved together; bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -318,20 +316,14 @@ class BandCovariance:
     def _of_path(
         self, through: Float[Tensor, "n m w"], entry: Int[Tensor, "n m w"], reduced: _Reduced
     ) -> Float[Tensor, "n m m"]:
-        """The part that comes through the path: functions of its entries."""
-        unknowns, m = len(self._equations.path_gradient), through.shape[1]
+        """The part that comes through the path: functions of its entries, the same ones in a row."""
+        at, m = entry[:, 0], through.shape[1]
+        reach = int((at.amax(1) - at.amin(1)).max()) if len(at) else 0
+        inverse = BandInverse.of(reduced.path, reach)
         parts = [through.new_zeros(0, m, m)]
-        for start in range(0, len(through), max(COLUMNS_AT_ONCE // m, 1)):
-            part = slice(start, start + max(COLUMNS_AT_ONCE // m, 1))
-            at = entry[part]
-            number = torch.arange(len(at) * m, device=at.device).reshape(-1, m)
-            function = through.new_zeros(unknowns, len(at) * m)
-            function.index_put_(
-                (at, number[..., None].expand_as(at)), through[part], accumulate=True
-            )
-            solved = reduced.path.solve(function)
-            # Of the solution those rows count that the row's own functions read.
-            parts.append(through[part] @ solved[at[:, 0, :, None], number[:, None]])
+        for some in torch.arange(len(at), device=at.device).split(_LANDMARKS_AT_ONCE):
+            own = inverse.read(at[some][:, :, None], at[some][:, None])
+            parts.append(through[some] @ own @ through[some].mT)
         return torch.cat(parts)
 
 
