@@ -170,14 +170,16 @@ def map_journeys(
     stored: Sequence[StoredDrive] | None = None,
     progress: ProgressCall = silent,
     known: Mapping[int, JourneyMap] | None = None,
+    tracklets: Mapping[int, Tracklets] | None = None,
     keep: KeepCall = forget,
 ) -> tuple[JourneyMap, ...]:
     """Section IV for every journey, by the workers of an engine (None: in this process), each on one core.
 
     The result depends neither on the engine nor on its workers. Those read the journeys themselves where these are `stored`,
     else they are handed over; drives on a GPU stay in this process. Those that are `known`, by number, are taken as they
-    are; `keep` is handed the others with their numbers, as soon as each is there. ChildProcessError, with the journey's
-    name, if the worker of a journey is killed again and again.
+    are; of others the `tracklets` that sign detections are associated to may be known. `keep` is handed those that were
+    mapped with their numbers, as soon as each is there. ChildProcessError, with the journey's name, if the worker of a
+    journey is killed again and again.
     """
     stage, total = "single journeys", len(journeys)
     maps = dict(known or {})
@@ -185,10 +187,11 @@ def map_journeys(
     left = [number for number in range(total) if number not in maps]
     if engine is None or any(journeys[number].t_ns.is_cuda for number in left[:1]):
         engine = InProcess()
+    tracked = tracklets or {}
     calls: list[Call] = [
-        (journeys[n].journey_id, map_journey, (journeys[n], n, config))
+        (journeys[n].journey_id, map_journey, (journeys[n], n, config, tracked.get(n)))
         if stored is None or engine.shares_memory
-        else (journeys[n].journey_id, map_stored, (stored[n], n, config))
+        else (journeys[n].journey_id, map_stored, (stored[n], n, config, tracked.get(n)))
         for n in left
     ]
     for place, made in engine.each(calls):
@@ -199,17 +202,25 @@ def map_journeys(
     return tuple(maps[number] for number in range(total))
 
 
-def map_stored(drive: StoredDrive, number: int, config: MapperConfig) -> JourneyMap:
+def map_stored(
+    drive: StoredDrive, number: int, config: MapperConfig, tracklets: Tracklets | None = None
+) -> JourneyMap:
     """Section IV of a journey that is read where the work is done."""
-    return map_journey(drive.read(), number, config)
+    return map_journey(drive.read(), number, config, tracklets)
 
 
 @one_core_each()
 @torch.no_grad()
-def map_journey(journey: Journey, number: int, config: MapperConfig) -> JourneyMap:
-    """Section IV: the signs and lanes of one journey, the `number`-th of the dataset."""
+def map_journey(
+    journey: Journey, number: int, config: MapperConfig, tracklets: Tracklets | None = None
+) -> JourneyMap:
+    """Section IV: the signs and lanes of one journey, the `number`-th of the dataset.
+
+    `tracklets` are what `associate_signs` gives, where that is known already.
+    """
     config = config.resolved()
-    tracklets = associate_signs(journey, config.positioning, config.sign_association)
+    if tracklets is None:
+        tracklets = associate_signs(journey, config.positioning, config.sign_association)
     signs, sign_report = triangulate_signs(
         journey, tracklets, config.positioning, config.sign_triangulation
     )

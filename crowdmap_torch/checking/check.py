@@ -13,7 +13,7 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.errors import Code, InputError
 from crowdmap_torch.io.faults import Fault
 from crowdmap_torch.io.inspection import inspect_dataset
-from crowdmap_torch.plausibility.dataset import findings_by_journey
+from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding, Repair
 from crowdmap_torch.plausibility.lever import HIDDEN_LEVER
 from crowdmap_torch.plausibility.units import raw_findings, read_raw_poses
@@ -87,8 +87,8 @@ def check_dataset(folder: Path, config: MapperConfig | None = None) -> Check:
         dataset = _usable(folder)
         found = _format_items(folder, faults)
         if dataset is not None:
-            seen = findings_by_journey(folder, dataset, config.positioning, config.sign_association)
-            found += _items_of(seen)
+            seen = look_over(folder, dataset, config.positioning, config.sign_association)
+            found += _items_of(seen.by_journey)
             found += _copies(dataset, {f.path for f in faults if not f.drops})
     order = (STOPS, SPOILS, NOTE)
     found.sort(key=lambda item: order.index(item.severity))

@@ -14,7 +14,7 @@ import io
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,26 +28,24 @@ import torch
 from crowdmap_torch import __version__, mapper
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.calibration import CalibrationConfig
+from crowdmap_torch.commands.whereabouts import Whereabouts
 from crowdmap_torch.config import MapperConfig, dump, load_config
 from crowdmap_torch.evaluation.evaluate import against, control_ids_of
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
-from crowdmap_torch.fleet.choice import ENGINES, engine_of
-from crowdmap_torch.fleet.engine import Engine
+from crowdmap_torch.fleet.choice import ENGINES
 from crowdmap_torch.io.area import Area, Cut, cut_dataset, cut_truth, read_area
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
 from crowdmap_torch.io.documents import plain
-from crowdmap_torch.io.errors import InputError, input_read, needing, one_line
+from crowdmap_torch.io.errors import InputError, input_read, one_line
 from crowdmap_torch.io.maps import certain_part
-from crowdmap_torch.io.stored_drives import stored_drives
 from crowdmap_torch.io.tiled_maps import DEFAULT_LEVEL, TileLevel
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.noise.calibration import KnownCalibration
-from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.processes.interrupts import keeping
-from crowdmap_torch.processes.threads import one_core_each, repeatable
+from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.ranges import Count, Workers, argument
 from crowdmap_torch.report.fates import missing_findings
 from crowdmap_torch.report.html import write_report
@@ -164,16 +162,16 @@ def run(options: argparse.Namespace) -> int:
     with input_read():
         refuse_overlap(options.out, options.dataset)
         folder = RunFolder(options.out, overwrite=options.overwrite, resume=options.resume)
-        engine = _engine(options, _device(options.device))
+        where = Whereabouts(options)
     # The folder first: whether it can be written, and by nobody else, is known before anything is read at length.
-    with keeping(folder.kept), folder.claimed(), one_core_each():
-        return _map(options, folder, config, engine)
+    with keeping(folder.kept), folder.claimed(), one_core_each(), where:
+        return _map(options, folder, config, where)
 
 
 def _map(
-    options: argparse.Namespace, folder: RunFolder, config: MapperConfig, engine: Engine
+    options: argparse.Namespace, folder: RunFolder, config: MapperConfig, where: Whereabouts
 ) -> int:
-    device = torch.device(options.device)
+    device = where.device
     with input_read():
         given = _read(options, config, device)
         dataset, survey, truth = given.dataset, given.survey, given.truth
@@ -182,7 +180,9 @@ def _map(
         found = _take_up(kept, folder, len(dataset.journeys), device) if options.resume else Found()
     if found is None:
         return 0
-    findings = _looked_over(options.dataset, dataset, config)
+    where.begin(is_needed=len(found.journeys) < len(dataset.journeys))
+    look = where.looked_over(options.dataset, dataset, config, inputs["journey"])
+    findings = _told(look.findings, dataset)
 
     progress = Progress(io.StringIO() if options.quiet else None)
     folder.prepare(options.dataset)
@@ -192,11 +192,10 @@ def _map(
 
         # ---- one journey at a time (section IV) ----
         journeys = dataset.journeys
-        stored = stored_drives(options.dataset, dataset, inputs["journey"], config.reading)
         keep = keep_and_log(kept.keep_journey, log, journeys)
-        with _begun(engine, is_needed=len(found.journeys) < len(journeys)) as where:
-            how = {"engine": where, "stored": stored, "progress": progress, "keep": keep}
-            maps = mapper.map_journeys(journeys, config, known=found.journeys, **how)
+        how = {"known": found.journeys, "progress": progress, "keep": keep}
+        maps = mapper.map_journeys(journeys, config, **where.by_whom(look, config), **how)
+        where.close()
 
         # ---- landmarks of all journeys told apart, biases found (section V-A) ----
         progress("clusters and biases")
@@ -237,7 +236,7 @@ def _map(
         progress.finish()
         missing = _told(missing_findings(dataset, result, config), dataset)
         warnings = (*findings, *_told(unsettled_findings(first), dataset), *missing)
-        spent = progress, engine.spent_on()
+        spent = progress, where.engine.spent_on()
         metrics = metrics_of(dataset, result, config, watch.iterations, *spent, *compared)
         folder.write_metrics({**metrics, "area": plain(given.cut), "warnings": plain(warnings)})
         with _spared("report"):
@@ -337,12 +336,6 @@ def _tell_rejected(rejected: Sequence[RejectedJourney]) -> None:
         print(f"set aside {journey.journey_id}: {journey.reason}", file=sys.stderr)
 
 
-def _looked_over(folder: Path, dataset: Dataset, config: MapperConfig) -> tuple[Finding, ...]:
-    with reading(config.reading):
-        findings = look_over(folder, dataset, config.positioning, config.sign_association)
-    return _told(findings, dataset)
-
-
 def _told(findings: tuple[Finding, ...], dataset: Dataset) -> tuple[Finding, ...]:
     """The findings, each told on stderr in a line."""
     for finding in findings:
@@ -397,37 +390,3 @@ def _area(text: str) -> Area:
         return read_area(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _engine(options: argparse.Namespace, device: torch.device) -> Engine:
-    """Where journeys are mapped, not begun yet."""
-    name = options.engine
-    if device.type == "cuda":
-        if name not in (None, "local"):
-            raise ValueError(
-                f"--engine {name}: what runs on a GPU stays in this process; leave it out"
-            )
-        name = "local"
-    with needing(f"--engine {name}", "'crowdmap_torch[ray]'"):
-        return engine_of(name, workers=options.workers, address=options.address)
-
-
-@contextmanager
-def _begun(engine: Engine, *, is_needed: bool) -> Iterator[Engine | None]:
-    """The engine at work, and no engine where there is none for it."""
-    with ExitStack() as stack:
-        if is_needed:
-            with input_read():
-                stack.enter_context(engine)
-        yield engine if is_needed else None
-
-
-def _device(name: str) -> torch.device:
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"--device {name}: no CUDA device is there; use --device cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ValueError(f"--device {name}: expected cpu or cuda") from None
-    repeatable(device)
-    return device

@@ -59,33 +59,50 @@ class SignsSeen:
     count: int
 
 
+@dataclass(frozen=True)
+class DriveRays:
+    """How well the rays of one journey meet."""
+
+    misfit_px: float
+    size_m: float
+    """Median of its signs."""
+    tried: tuple[tuple[str, float, Finding], ...]
+    """Mistakes by name, the misfit where each is undone against that of what is given, and what is said of it then."""
+
+
+def drive_rays(
+    journey: Journey, tracks: Tracklets, limits: ConsistencyLimits | None = None
+) -> DriveRays | None:
+    """How well a journey's rays meet, as they are given and under every usual mistake; None if no sign tells."""
+    limits = limits or ConsistencyLimits()
+    views = sign_views(journey, tracks, limits.least_views)
+    rays = None if views is None else rays_of(views, journey.rig.camera)
+    met = None if rays is None else met_at(journey, rays, 0, limits)
+    if views is None or rays is None or met is None:
+        return None
+    given = met.misfit_px
+    size = float((views.extent_px * met.distance)[met.counted].median()) / rays.focal_px
+    tried = []
+    for name, camera, shift, finding in _instead(journey, limits):
+        other = rays if camera is journey.rig.camera else rays_of(views, camera)
+        under = met_at(journey, other, shift, limits)
+        tried.append((name, math.inf if under is None else under.misfit_px / given, finding))
+    return DriveRays(given, size, tuple(tried))
+
+
 def consistency_findings(
-    journeys: Sequence[Journey],
-    tracklets: Sequence[Tracklets],
-    limits: ConsistencyLimits | None = None,
+    drives: Sequence[DriveRays | None], limits: ConsistencyLimits | None = None
 ) -> list[Finding]:
     """Mistakes of all journeys under which their signs' rays do not meet."""
     limits = limits or ConsistencyLimits()
-    given_px: list[float] = []
-    sizes: list[float] = []
+    told = [drive for drive in drives if drive is not None]
     tried: dict[str, list[float]] = {}
     findings: dict[str, Finding] = {}
-    for journey, tracks in zip(journeys, tracklets, strict=True):
-        views = sign_views(journey, tracks, limits.least_views)
-        rays = None if views is None else rays_of(views, journey.rig.camera)
-        met = None if rays is None else met_at(journey, rays, 0, limits)
-        if views is None or rays is None or met is None:
-            continue
-        given = met.misfit_px
-        sizes.append(float((views.extent_px * met.distance)[met.counted].median()) / rays.focal_px)
-        given_px.append(given)
-        for name, camera, shift, finding in _instead(journey, limits):
-            other = rays if camera is journey.rig.camera else rays_of(views, camera)
-            under = met_at(journey, other, shift, limits)
-            ratio = math.inf if under is None else under.misfit_px / given
+    for drive in told:
+        for name, ratio, finding in drive.tried:
             tried.setdefault(name, []).append(ratio)
             findings[name] = finding
-    if scale := _scale_findings(sizes, limits):
+    if scale := _scale_findings([drive.size_m for drive in told], limits):
         return scale
     named = []
     for name, ratios in tried.items():
@@ -99,7 +116,7 @@ def consistency_findings(
     if not named:
         return []
     ratio, name = min(named)
-    usual = sorted(given_px)[len(given_px) // 2]
+    usual = sorted(drive.misfit_px for drive in told)[len(told) // 2]
     evidence = (
         f"rays to one sign miss each other by {usual:.1f} px, and by {ratio * usual:.1f} px if"
     )

@@ -111,29 +111,37 @@ _UNIT_K1 = -0.1
 """The lens of which pixels of rigs without one may have a share."""
 
 
+def own_missing_lens(
+    journey: Journey,
+    tracks: Tracklets,
+    positioning: PositioningNoise,
+    limits: LensLimits | None = None,
+) -> MissingLens | None:
+    """The share of its rig's lens that a journey's pixels are without; of a usual one where the rig has none."""
+    camera = journey.rig.camera
+    distortion = camera.K.new_tensor([_UNIT_K1, 0, 0, 0] if is_bare(journey.rig) else [])
+    other = replace(camera, model="brown_conrady", distortion=distortion)
+    return missing_lens(journey, tracks, other, positioning, limits or LensLimits())
+
+
 def lens_findings(
     journeys: Sequence[Journey],
-    tracklets: Sequence[Tracklets],
-    positioning: PositioningNoise,
+    missing: Sequence[MissingLens | None],
     limits: LensLimits | None = None,
     *,
     rival: float = 0.0,
 ) -> list[tuple[str, Finding]]:
     """Lenses of rigs that the pixels do not have, and lenses of pixels that the rigs do not have, with the journeys.
 
-    What explains the same misfit by so many standard deviations is a `rival`: a lens is named by more of them alone.
+    What is `missing` is that of each journey's `own_missing_lens`. What explains the same misfit by so many standard
+    deviations is a `rival`: a lens is named by more of them alone.
     """
     limits = limits or LensLimits()
     bent: dict[str, MissingLens] = {}
     bare: dict[str, MissingLens] = {}
-    for journey, tracks in zip(journeys, tracklets, strict=True):
-        camera = journey.rig.camera
-        has_none = is_bare(journey.rig)
-        distortion = camera.K.new_tensor([_UNIT_K1, 0, 0, 0] if has_none else [])
-        other = replace(camera, model="brown_conrady", distortion=distortion)
-        found = missing_lens(journey, tracks, other, positioning, limits)
+    for journey, found in zip(journeys, missing, strict=True):
         if found is not None:
-            (bare if has_none else bent)[journey.journey_id] = found
+            (bare if is_bare(journey.rig) else bent)[journey.journey_id] = found
     named = (
         _undistorted(bent.values(), limits, rival),
         _without_lens(bare.values(), limits, rival),

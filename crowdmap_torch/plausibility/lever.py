@@ -69,8 +69,8 @@ class Lever:
 
 
 @dataclass(frozen=True)
-class _Said:
-    """What a journey says: `told = gain * lever + noise`."""
+class Said:
+    """What a journey says of the lever: `told = gain * lever + noise`."""
 
     told: float
     gain: float
@@ -88,17 +88,9 @@ _FLAT = 1e-9
 """What is known of signs before they are seen, as a share of what is known of them then."""
 
 
-def lever_of(
-    journeys: Sequence[Journey],
-    tracklets: Sequence[Tracklets],
-    positioning: PositioningNoise,
-    limits: LeverLimits | None = None,
-) -> Lever | None:
+def lever_of(said: Sequence[Said | None], limits: LeverLimits | None = None) -> Lever | None:
     """The lever that all journeys together show; None where too few of them tell anything."""
-    limits = limits or LeverLimits()
-    pairs = zip(journeys, tracklets, strict=True)
-    said = [_said(journey, tracks, positioning, limits) for journey, tracks in pairs]
-    return _together([one for one in said if one is not None], limits)
+    return _together([one for one in said if one is not None], limits or LeverLimits())
 
 
 def lever_findings(lever: Lever | None, limits: LeverLimits | None = None) -> list[Finding]:
@@ -137,7 +129,7 @@ def hidden_lever(lever: Lever | None, limits: LeverLimits | None = None) -> list
     ]
 
 
-def _together(said: Sequence[_Said], limits: LeverLimits) -> Lever | None:
+def _together(said: Sequence[Said], limits: LeverLimits) -> Lever | None:
     gain = sum(one.gain for one in said)
     if len(said) < limits.least_journeys or gain <= 0:
         return None
@@ -164,9 +156,14 @@ class _Seen:
     focal_px: float
 
 
-def _said(
-    journey: Journey, tracks: Tracklets, positioning: PositioningNoise, limits: LeverLimits
-) -> _Said | None:
+def said_of_lever(
+    journey: Journey,
+    tracks: Tracklets,
+    positioning: PositioningNoise,
+    limits: LeverLimits | None = None,
+) -> Said | None:
+    """What a journey says of the lever; None where it tells nothing."""
+    limits = limits or LeverLimits()
     views = sign_views(journey, tracks, limits.views[0])
     rays = None if views is None else rays_of(views, journey.rig.camera)
     seen = None if rays is None else _seen(journey, rays, limits)
@@ -174,7 +171,7 @@ def _said(
         return None
     pieces = [_of(piece, positioning) for piece in _pieces(seen, limits)]
     told, gain, variance = (sum(of_each) for of_each in zip(*map(astuple, pieces), strict=True))
-    return _Said(told, gain, variance)
+    return Said(told, gain, variance)
 
 
 def _seen(journey: Journey, rays: Rays, limits: LeverLimits) -> _Seen | None:
@@ -270,7 +267,7 @@ def _at(
     return (1 - share) * place[before] + share * place[after]
 
 
-def _of(seen: _Seen, positioning: PositioningNoise) -> _Said:
+def _of(seen: _Seen, positioning: PositioningNoise) -> Said:
     """What signs at unknown places, seen from poses that drift, say of the lever.
 
     Signs are found first, as if there were none (Gauss-Newton, drift and noise as one covariance). What they leave is
@@ -291,7 +288,7 @@ def _of(seen: _Seen, positioning: PositioningNoise) -> _Said:
         point = point + moved.unflatten(0, (n, 3))
     w = _whitened(seen, point, noise_px, inflated, positioning)
     asked = w.asked - w.by_sign @ w.solved(w.asked)
-    return _Said(float(asked @ w.missed), float(asked @ w.shows), float(asked @ asked))
+    return Said(float(asked @ w.missed), float(asked @ w.shows), float(asked @ asked))
 
 
 @dataclass(frozen=True)

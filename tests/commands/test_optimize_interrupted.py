@@ -72,7 +72,7 @@ def maps(small: Path, rough: Path) -> tuple[mapper.JourneyMap, ...]:
 def patched(maps: tuple[mapper.JourneyMap, ...]) -> Iterator[pytest.MonkeyPatch]:
     """Each journey's own map is in memory, and no report is drawn: what follows and precedes them is the tests'."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mapper, "map_journey", lambda journey, number, config: maps[number])
+        patch.setattr(mapper, "map_journey", lambda journey, number, *_: maps[number])
         patch.setattr(optimize_command, "write_report", lambda path, record: path.touch())
         yield patch
 

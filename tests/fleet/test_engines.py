@@ -24,9 +24,12 @@ from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.stored_drives import StoredDrive, stored_drives
 from crowdmap_torch.io.trees import digest
 from crowdmap_torch.mapper import map_journeys
+from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.tables import Dataset
+from crowdmap_torch.tracking.signs import associate_signs
 
 CONFIG = MapperConfig()
+PAIR = CONFIG.positioning, CONFIG.sign_association
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not here: extra `ray`")
 BESIDE = ["processes", pytest.param("ray", marks=needs_ray)]
 """Engines whose workers can be killed."""
@@ -99,6 +102,26 @@ def test_workers_that_read_drives_themselves_give_the_same_bits_and_so_does_a_se
     assert engine.spent.again == killed == len(caplog.messages) == len(list(tmp_path.iterdir()))
     assert all("journey-001" in said and "done again" in said for said in caplog.messages)
     assert engine.spent.tasks == 3 and engine.spent.seconds > 0
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_workers_tell_signs_apart_for_the_look_as_mapping_does(
+    begin: Begin,
+    folder: Path,
+    dataset: Dataset,
+    stored: Sequence[StoredDrive],
+    made: str,
+    stated: bool,
+):
+    engine = begin("processes", 2)
+    drives = stored if stated else None
+    look = look_over(folder, dataset, *PAIR, engine=engine, stored=drives)
+    alone = look_over(folder, dataset, *PAIR)
+    assert look.by_journey == alone.by_journey
+    assert len(look.tracklets) == len(dataset.journeys)
+    assert digest(look.tracklets[1]) == digest(associate_signs(dataset.journeys[1], *PAIR))
+    maps = map_journeys(dataset.journeys, CONFIG, engine=engine, tracklets=look.tracklets)
+    assert digest(maps) == made
 
 
 @pytest.mark.parametrize("name", MOST)

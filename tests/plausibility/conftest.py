@@ -41,7 +41,7 @@ def look() -> Look:
         config = MapperConfig()
         dataset = load_dataset(folder)
         found = look_over(folder, dataset, config.positioning, config.sign_association)
-        return {finding.kind: finding for finding in found}
+        return {finding.kind: finding for finding in found.findings}
 
     return find
 

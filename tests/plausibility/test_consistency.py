@@ -6,12 +6,12 @@ import pytest
 import torch
 from worlds.winding import winding_drive
 
-from crowdmap_torch.plausibility.consistency import consistency_findings
+from crowdmap_torch.plausibility.consistency import consistency_findings, drive_rays
 from crowdmap_torch.tables import Journey, Tracklets
 
 
 def found(drives: list[tuple[Journey, Tracklets]]):
-    return consistency_findings([j for j, _ in drives], [t for _, t in drives])
+    return consistency_findings([drive_rays(journey, tracks) for journey, tracks in drives])
 
 
 def test_rays_of_exact_drives_meet() -> None:
@@ -28,4 +28,5 @@ def test_frames_that_are_numbered_late_are_named_with_how_many(late: int) -> Non
 def test_drives_without_tracked_signs_say_nothing() -> None:
     journey, tracks = winding_drive(0)
     nothing = replace(tracks, label=torch.full_like(tracks.label, -1))
-    assert consistency_findings([journey], [nothing]) == []
+    assert drive_rays(journey, nothing) is None
+    assert consistency_findings([None]) == []

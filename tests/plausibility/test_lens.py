@@ -20,6 +20,7 @@ from crowdmap_torch.plausibility.lens import (
     _without_lens,
     lens_findings,
     missing_lens,
+    own_missing_lens,
 )
 from crowdmap_torch.soak.spoiled import relensed, spoiled
 from crowdmap_torch.tables import Journey, Tracklets
@@ -33,9 +34,17 @@ def tracked(journeys: Sequence[Journey]) -> list[Tracklets]:
     return [associate_signs(j, CONFIG.positioning, CONFIG.sign_association) for j in journeys]
 
 
+def found_in(
+    journeys: Sequence[Journey], tracklets: Sequence[Tracklets]
+) -> list[tuple[str, Finding]]:
+    pairs = zip(journeys, tracklets, strict=True)
+    own = [own_missing_lens(journey, tracks, CONFIG.positioning) for journey, tracks in pairs]
+    return lens_findings(journeys, own)
+
+
 def found(folder: Path) -> list[tuple[str, Finding]]:
     journeys = load_dataset(folder).journeys
-    return lens_findings(journeys, tracked(journeys), CONFIG.positioning)
+    return found_in(journeys, tracked(journeys))
 
 
 def without_lens(camera: Camera) -> Camera:
@@ -52,7 +61,7 @@ def missing(journey: Journey, tracks: Tracklets) -> MissingLens:
 def test_a_mild_lens_is_told_from_none(winding_folder: Path, tmp_path: Path) -> None:
     raw = relensed(winding_folder, tmp_path / "raw", MILD)
     journeys = load_dataset(raw).journeys[:2]
-    assert lens_findings(journeys, tracked(journeys), CONFIG.positioning) == []
+    assert found_in(journeys, tracked(journeys)) == []
     named = found(spoiled(raw, tmp_path / "bad", "undistorted"))
     assert {finding.kind for _, finding in named} == {"undistorted"}
     assert len(named) == 4
@@ -89,39 +98,28 @@ def test_noise_of_pixels_does_not_make_a_lens_stronger(good: Path) -> None:
 def test_drives_that_tell_nothing_are_passed_over(good: Path) -> None:
     journeys = load_dataset(good).journeys
     nothing = [Tracklets(torch.full_like(j.signs.frame, -1), 0) for j in journeys]
-    assert lens_findings(journeys, nothing, CONFIG.positioning) == []
-    assert lens_findings([], [], CONFIG.positioning) == []
+    assert found_in(journeys, nothing) == []
+    assert lens_findings([], []) == []
 
 
-def test_drives_that_differ_as_drives_do_decide_together(
-    monkeypatch: pytest.MonkeyPatch, good: Path
-) -> None:
+def test_drives_that_differ_as_drives_do_decide_together(good: Path) -> None:
     journeys = 2 * load_dataset(good).journeys
     bare = [
         replace(j, journey_id=str(k), rig=replace(j.rig, camera=without_lens(j.rig.camera)))
         for k, j in enumerate(journeys)
     ]
-    nothing = [Tracklets(torch.full_like(j.signs.frame, -1), 0) for j in bare]
     # Of a highway and a narrow camera: nearly six of their own sigmas together, over four of what drives differ by.
-    said = iter([(0.81, 0.26), (1.06, 0.28), (1.55, 0.42), (0.43, 0.39)])
-    monkeypatch.setattr(
-        "crowdmap_torch.plausibility.lens.missing_lens", lambda *_: MissingLens(*next(said))
-    )
-    named = lens_findings(bare, nothing, CONFIG.positioning)
+    said = [(0.81, 0.26), (1.06, 0.28), (1.55, 0.42), (0.43, 0.39)]
+    named = lens_findings(bare, [MissingLens(*one) for one in said])
     assert {finding.kind for _, finding in named} == {"no-lens"}
 
 
 @pytest.mark.parametrize("shares", [(0.0, 1.0), (1.0, -1.0)])
 def test_drives_that_contradict_each_other_do_not_decide(
-    shares: tuple[float, ...], monkeypatch: pytest.MonkeyPatch, good: Path
+    shares: tuple[float, ...], good: Path
 ) -> None:
     journeys = load_dataset(good).journeys
-    nothing = [Tracklets(torch.full_like(j.signs.frame, -1), 0) for j in journeys]
-    said = iter(shares)
-    monkeypatch.setattr(
-        "crowdmap_torch.plausibility.lens.missing_lens", lambda *_: MissingLens(next(said), 0.05)
-    )
-    assert lens_findings(journeys, nothing, CONFIG.positioning) == []
+    assert lens_findings(journeys, [MissingLens(share, 0.05) for share in shares]) == []
 
 
 def test_a_lens_is_named_unless_a_lever_explains_more() -> None:

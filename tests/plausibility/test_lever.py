@@ -15,11 +15,12 @@ from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.plausibility.lever import (
     Lever,
     LeverLimits,
-    _Said,
+    Said,
     _together,
     hidden_lever,
     lever_findings,
     lever_of,
+    said_of_lever,
 )
 from crowdmap_torch.tables import Journey, Tracklets
 
@@ -28,7 +29,7 @@ LIMITS = LeverLimits()
 
 
 def lever(drives: list[tuple[Journey, Tracklets]]) -> Lever | None:
-    return lever_of([j for j, _ in drives], [t for _, t in drives], NOISE)
+    return lever_of([said_of_lever(journey, tracks, NOISE) for journey, tracks in drives])
 
 
 def drifting(
@@ -105,9 +106,9 @@ def test_drives_that_contradict_each_other_show_no_lever_arm() -> None:
     places = [0.94, -1.37, -1.80, -1.82, -0.15, 1.43]
     known = 1 / 0.3**2
     for shift in (0.0, -0.6):
-        said = [_Said(known * (place + shift), known, known) for place in places]
+        said = [Said(known * (place + shift), known, known) for place in places]
         assert lever_findings(_together(said, LIMITS)) == []
-    said = [_Said(known * (place / 10 - 1.2), known, known) for place in places]
+    said = [Said(known * (place / 10 - 1.2), known, known) for place in places]
     (finding,) = lever_findings(_together(said, LIMITS))
     assert "1.2 m behind" in finding.evidence
 
@@ -115,9 +116,9 @@ def test_drives_that_contradict_each_other_show_no_lever_arm() -> None:
 def test_a_long_drive_says_stretch_by_stretch_what_it_says_as_a_whole() -> None:
     arm = torch.tensor([0.2, -0.5, -1.5]).double()
     drives = [spoiled(winding_drive(seed, lever=arm), seed) for seed in range(5)]
-    journeys, tracks = [j for j, _ in drives], [t for _, t in drives]
-    whole = lever_of(journeys, tracks, NOISE)
-    cut = lever_of(journeys, tracks, NOISE, replace(LIMITS, at_once=40))
+    short = replace(LIMITS, at_once=40)
+    whole = lever(drives)
+    cut = lever_of([said_of_lever(journey, tracks, NOISE, short) for journey, tracks in drives])
     assert whole is not None and cut is not None
     assert abs(cut.ahead_m - whole.ahead_m) < whole.sigma_m
     assert cut.sigma_m == pytest.approx(whole.sigma_m, rel=0.3)

@@ -1,0 +1,98 @@
+"""Where `crowdmap optimize` works, by `--device`, `--engine`, `--workers` and `--address`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TypedDict
+
+import torch
+
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.fleet.choice import engine_of
+from crowdmap_torch.fleet.engine import Engine, Spent
+from crowdmap_torch.io.budget import reading
+from crowdmap_torch.io.errors import input_read, needing
+from crowdmap_torch.io.stored_drives import StoredDrive, stored_drives
+from crowdmap_torch.plausibility.dataset import Look, look_over
+from crowdmap_torch.processes.threads import repeatable
+from crowdmap_torch.tables import Dataset, Tracklets
+
+
+class ByWhom(TypedDict):
+    """What `mapper.map_journeys` is told of who works."""
+
+    engine: Engine | None
+    stored: Sequence[StoredDrive] | None
+    tracklets: Mapping[int, Tracklets]
+
+
+class Whereabouts(ExitStack):
+    """The device and the engine of a run, and the workers that look at its journeys and map them.
+
+    A context manager that ends the workers, if they have not been ended.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        """ValueError if what is asked for is not there; nothing is begun."""
+        super().__init__()
+        self.device = _device(options.device)
+        self.engine = _engine(options, self.device)
+        self.at_work: Engine | None = None
+        """The engine, where there is work for it."""
+        self.stored: tuple[StoredDrive, ...] | None = None
+        """Where workers find the journeys; None: they are handed over."""
+
+    def begin(self, *, is_needed: bool) -> None:
+        """Begins the engine if there is work for it and it has not been begun."""
+        if is_needed and self.at_work is None:
+            with input_read():
+                self.at_work = self.enter_context(self.engine)
+
+    def looked_over(
+        self, folder: Path, dataset: Dataset, config: MapperConfig, digests: Mapping[str, str]
+    ) -> Look:
+        """What looks wrong with the data set, by the workers; `digests` are those of the journeys, by id."""
+        if self.engine.name == "ray":
+            # Workers may be elsewhere. Those beside this process would take longer to read a journey than to be handed it.
+            self.stored = stored_drives(folder, dataset, digests, config.reading)
+        noise, association = config.positioning, config.sign_association
+        with reading(config.reading):
+            look = look_over(
+                *(folder, dataset, noise, association), engine=self.at_work, stored=self.stored
+            )
+        # What metrics.json says that workers took is mapping's.
+        self.engine.spent = Spent()
+        return look
+
+    def by_whom(self, look: Look, config: MapperConfig) -> ByWhom:
+        """Who maps journeys, and the signs that were told apart for the look where mapping would do it alike."""
+        is_alike = config.resolved().sign_association == config.sign_association
+        tracklets = look.tracklets if is_alike and self.device.type == "cpu" else {}
+        return {"engine": self.at_work, "stored": self.stored, "tracklets": tracklets}
+
+
+def _device(name: str) -> torch.device:
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"--device {name}: no CUDA device is there; use --device cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise ValueError(f"--device {name}: expected cpu or cuda") from None
+    repeatable(device)
+    return device
+
+
+def _engine(options: argparse.Namespace, device: torch.device) -> Engine:
+    """Where journeys are mapped, not begun yet."""
+    name = options.engine
+    if device.type == "cuda":
+        if name not in (None, "local"):
+            raise ValueError(
+                f"--engine {name}: what runs on a GPU stays in this process; leave it out"
+            )
+        name = "local"
+    with needing(f"--engine {name}", "'crowdmap_torch[ray]'"):
+        return engine_of(name, workers=options.workers, address=options.address)
