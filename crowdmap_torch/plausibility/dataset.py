@@ -167,6 +167,11 @@ def _findings_of(folder: Path, journey: Journey, dataset: Dataset) -> Iterator[F
     yield from rig_findings(journey.rig)
     yield from pose_findings(journey, dataset.origin)
     signs, lanes = (_outlines(folder / f"{name}.parquet") for name in ("signs", "lanes"))
+    own = journey.lane_points
+    if len(own) == len(lanes.px):
+        # None was dropped: those of the journey are known without the lens.
+        count = torch.bincount(own.detection, minlength=len(journey.lanes))
+        lanes = Outlines(own.px.numpy(), count.numpy(), own.ideal)
     yield from detection_findings(signs, lanes, journey.rig)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from crowdmap_torch.geometry.camera import unproject
 from crowdmap_torch.plausibility.finding import Finding, Repair
@@ -25,6 +26,12 @@ class Outlines:
     px: Float[np.ndarray, "p 2"]
     count: Int[np.ndarray, " n"]
     """Points of each row, one at least."""
+    ideal: Float[Tensor, "p 2"] | None = None
+    """The points without the lens; None: not known yet."""
+
+    def at(self, px: Float[np.ndarray, "p 2"]) -> Outlines:
+        """The same rows with their points elsewhere."""
+        return Outlines(px, self.count)
 
 
 @dataclass(frozen=True)
@@ -138,14 +145,14 @@ def _instead(
     """What detections may be instead, each with what it is called."""
 
     def changed(rows: Outlines, matrix: list[list[float]]) -> Outlines:
-        return replace(rows, px=rows.px @ np.array(matrix))
+        return rows.at(rows.px @ np.array(matrix))
 
     mirror = [[-1.0, 0.0], [0.0, 1.0]]
     width = rig.camera.width - 1
     # Read backwards an outline is its own mirror image, but for its place.
     turned = changed(signs, mirror)
     yield (
-        replace(turned, px=turned.px + _back(signs, width)),
+        turned.at(turned.px + _back(signs, width)),
         lanes,
         Finding(
             "anticlockwise",
@@ -185,7 +192,7 @@ def _instead(
 
 def _scaled(rows: Outlines, scale: float) -> Outlines:
     """Pixels of an image that is so many times as large; the border stays the border."""
-    return replace(rows, px=(rows.px + 0.5) * scale - 0.5)
+    return rows.at((rows.px + 0.5) * scale - 0.5)
 
 
 def _straightest(
@@ -298,7 +305,12 @@ def _area(rows: Outlines) -> Float[np.ndarray, " n"]:
 def _is_on_road(rows: Outlines, rig: Rig) -> np.ndarray:
     """By point, whether it lies in the image and below the horizon of the calibrated road."""
     inside = _in_image(rows.px, rig)
-    ideal, closes = unproject(rig.camera, torch.from_numpy(rows.px[inside]))
+    if rows.ideal is None:
+        ideal, closes = unproject(rig.camera, torch.from_numpy(rows.px[inside]))
+    else:
+        # The data set's reader has taken them all: every one closes.
+        ideal = rows.ideal[torch.from_numpy(inside)]
+        closes = torch.ones_like(ideal[:, 0], dtype=torch.bool)
     ray = torch.nn.functional.pad(ideal, (0, 1), value=1.0)
     # A road normal that points elsewhere is named by itself; a camera's down serves here.
     normal = rig.road_normal_camera.to(ray)

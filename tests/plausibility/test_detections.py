@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.geometry.camera import Camera, unproject
 from crowdmap_torch.plausibility.detections import Outlines, detection_findings
 from crowdmap_torch.tables import Rig
 
@@ -53,6 +53,17 @@ def test_sound_detections_are_sound_with_either_kind_missing() -> None:
         (NONE, NONE),
     ):
         assert kinds(signs, lanes) == []
+
+
+def test_points_that_are_known_without_the_lens_are_judged_alike() -> None:
+    high = markers()
+    high = Outlines(high.px - [0.0, 200.0], high.count)
+    for lanes in (markers(), high):
+        ideal, _ = unproject(RIG.camera, torch.from_numpy(lanes.px))
+        known = Outlines(lanes.px, lanes.count, ideal)
+        told, same = (list(detection_findings(NONE, rows, RIG)) for rows in (lanes, known))
+        assert told == same
+    assert told != []
 
 
 def test_few_rows_say_nothing() -> None:
