@@ -209,6 +209,10 @@ def map_stored(
     return map_journey(drive.read(), number, config, tracklets)
 
 
+def ready() -> None:
+    """A worker that has come here has imported all that mapping a journey takes."""
+
+
 @one_core_each()
 @torch.no_grad()
 def map_journey(

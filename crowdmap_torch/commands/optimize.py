@@ -165,6 +165,8 @@ def run(options: argparse.Namespace) -> int:
         where = Whereabouts(options)
     # The folder first: whether it can be written, and by nobody else, is known before anything is read at length.
     with keeping(folder.kept), folder.claimed(), one_core_each(), where:
+        if not options.resume:
+            where.begin_early(options.dataset)
         return _map(options, folder, config, where)
 
 

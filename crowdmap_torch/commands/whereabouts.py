@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TypedDict
 
 import torch
 
+from crowdmap_torch import mapper
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.engine import Engine, Spent
@@ -18,6 +19,7 @@ from crowdmap_torch.io.errors import input_read, needing
 from crowdmap_torch.io.stored_drives import StoredDrive, stored_drives
 from crowdmap_torch.plausibility.dataset import Look, look_over
 from crowdmap_torch.processes.threads import repeatable
+from crowdmap_torch.processes.workers import WorkerLost
 from crowdmap_torch.tables import Dataset, Tracklets
 
 
@@ -44,12 +46,36 @@ class Whereabouts(ExitStack):
         """The engine, where there is work for it."""
         self.stored: tuple[StoredDrive, ...] | None = None
         """Where workers find the journeys; None: they are handed over."""
+        self._starting = 0
 
     def begin(self, *, is_needed: bool) -> None:
         """Begins the engine if there is work for it and it has not been begun."""
         if is_needed and self.at_work is None:
             with input_read():
                 self.at_work = self.enter_context(self.engine)
+
+    def begin_early(self, folder: Path) -> None:
+        """Begins workers beside this process for the journeys of a data set that is yet to be read.
+
+        They import what they need, which takes seconds, while it is read.
+        """
+        if self.engine.name != "processes":
+            return
+        self.begin(is_needed=True)
+        with suppress(OSError):
+            journeys = sum(1 for _ in (folder / "journeys").iterdir())
+            for number in range(min(self.engine.free, journeys)):
+                self.engine.submit(number, ("the start of a worker", mapper.ready, ()))
+                self._starting += 1
+
+    def _await_workers(self) -> None:
+        """Waits for the workers that were begun early."""
+        while self._starting:
+            try:
+                self._starting -= len(self.engine.gather())
+            except WorkerLost:
+                # The first task begins another one.
+                self._starting -= 1
 
     def looked_over(
         self, folder: Path, dataset: Dataset, config: MapperConfig, digests: Mapping[str, str]
@@ -58,6 +84,7 @@ class Whereabouts(ExitStack):
         if self.engine.name == "ray":
             # Workers may be elsewhere. Those beside this process would take longer to read a journey than to be handed it.
             self.stored = stored_drives(folder, dataset, digests, config.reading)
+        self._await_workers()
         noise, association = config.positioning, config.sign_association
         with reading(config.reading):
             look = look_over(

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.geometry.camera import COEFFICIENT_COUNTS, MODELS, Camera, closing_share
-from crowdmap_torch.geometry.rig import camera_in_link
 from crowdmap_torch.io.budget import read_bytes
 from crowdmap_torch.io.documents import Document, read_yaml
 from crowdmap_torch.io.errors import InputError, one_line
@@ -200,6 +199,9 @@ def _read_mount(section: Document, folder: Path) -> Float[Tensor, "4 4"]:
     section.allow(("urdf", "pose_link", "camera_link"))
     name, links = section.place("urdf"), [section.text(k) for k in ("pose_link", "camera_link")]
     section.require_sound()
+    # It brings matplotlib along, half a second, which workers and rigs without a mount do not need.
+    from crowdmap_torch.geometry.rig import camera_in_link
+
     path = folder / name
     # Resolved, so that neither `..` nor a link leads out of the rig's folder.
     inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
