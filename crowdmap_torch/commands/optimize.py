@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TypedDict
 
@@ -30,7 +31,7 @@ from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.commands.whereabouts import Whereabouts
 from crowdmap_torch.config import MapperConfig, dump, load_config
-from crowdmap_torch.evaluation.evaluate import against, control_ids_of
+from crowdmap_torch.evaluation.evaluate import Against, against, control_ids_of
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
 from crowdmap_torch.fleet.choice import ENGINES
@@ -283,14 +284,18 @@ class _Given:
         self, log: TensorBoardLog, first: mapper.FirstMap, config: MapperConfig, *, every: int
     ) -> Watch:
         """What watches the adjustment, with errors against what is asked of the finished map."""
-        asked = None
-        if self.survey is not None:
-            known = () if self.control is None else control_ids_of(self.control, self.survey)
-            area = None if self.cut is None else Area(*self.cut.bbox)
-            truth = to_device(self.truth, "cpu")
-            asked = against(self.survey, truth=truth, control_ids=known, area=area)
         least = config.min_confidence
-        return Watch(log, asked, first.signs, first.lanes, every=every, min_confidence=least)
+        return Watch(log, self.asked, first.signs, first.lanes, every=every, min_confidence=least)
+
+    @cached_property
+    def asked(self) -> Against | None:
+        """What the survey asks of the map, of the finished one as of those on the way there."""
+        if self.survey is None:
+            return None
+        known = () if self.control is None else control_ids_of(self.control, self.survey)
+        area = None if self.cut is None else Area(*self.cut.bbox)
+        truth = to_device(self.truth, "cpu")
+        return against(self.survey, truth=truth, control_ids=known, area=area)
 
     def beside(self, device: torch.device) -> _Beside:
         """What is known beside the drives, for the bundle."""
@@ -364,15 +369,15 @@ def _compared(
     result: mapper.MapResult, config: MapperConfig, given: _Given, folder: RunFolder
 ) -> tuple[MapFigures | None, MapFigures | None]:
     """Figures of the map, which are printed, and of that of the cluster heads, where there is a survey."""
-    survey, truth, control = given.survey, given.truth, given.control
-    if survey is None:
+    survey, truth, asked = given.survey, given.truth, given.asked
+    if survey is None or asked is None:
         return None, None
     final, before = (
         certain_part(m, config.min_confidence) for m in (result.hd_map, result.map_clusters)
     )
-    figures = figures_of(final, survey, truth, folder.unfinished, control)
+    figures = figures_of(final, survey, truth, folder.unfinished, asked)
     print(format_figures(figures))
-    return figures, figures_of(before, survey, truth, None, control)
+    return figures, figures_of(before, survey, truth, None, asked)
 
 
 def _facts(options: argparse.Namespace, cut: Cut | None) -> dict[str, str]:

@@ -96,6 +96,7 @@ def evaluate_map(
     observable_ids: Collection[str] | None = None,
     gate_m: float = 3.0,
     notes: tuple[str, ...] = (),
+    asked: Against | None = None,
 ) -> MapFigures:
     """Figures of a map against a survey.
 
@@ -103,19 +104,20 @@ def evaluate_map(
     oracle, associations (`associations.journey` indexes `truth.journeys`) and single-journey
     `landmarks` are judged too. Without it every surveyed sign is observable, unless
     `observable_ids` names those that are. Of a map of a part of the world (`bbox` in its provenance) only what stands
-    inside that is. ValueError if the origins differ.
+    inside that is. What is `asked` follows from all this, and may be known already. ValueError if the origins differ.
     """
     refuse_other_origin(hd_map.origin, survey.origin)
     hd_map, survey, truth = to_device((hd_map, survey, truth), "cpu")
     associations, landmarks = to_device((associations, landmarks), "cpu")
     config = SignEvaluationConfig(match=SurveyMatchConfig(gate_m=gate_m))
-    asked = against(
-        survey,
-        truth=truth,
-        control_ids=control_ids,
-        observable_ids=observable_ids,
-        area=area_of(hd_map.provenance),
-    )
+    if asked is None:
+        asked = against(
+            survey,
+            truth=truth,
+            control_ids=control_ids,
+            observable_ids=observable_ids,
+            area=area_of(hd_map.provenance),
+        )
     comparison = compare_signs(
         hd_map.signs,
         survey.signs,

@@ -29,6 +29,7 @@ from crowdmap_torch.evaluation.visibility import frames_of_signs
 from crowdmap_torch.geometry import camera as camera_module
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.truth import JourneyTruth
+from crowdmap_torch.processes.threads import in_order
 from crowdmap_torch.ranges import Count, Settings
 from crowdmap_torch.survey.matching import DUPLICATE, FALSE
 from crowdmap_torch.tables import Lanes, Signs, Survey
@@ -36,6 +37,8 @@ from crowdmap_torch.tables import Lanes, Signs, Survey
 _SIGN_RANGE_M = 120.0
 _LANE_RANGE_M = 40.0
 """Frames further from a landmark are not looked at for the closest approach."""
+_NEAR = 3
+"""Frames in so small a part of that are looked at first."""
 _VIEW_STEP_M = 5.0
 """Distance of the places along a lane whose closest approach is looked up."""
 
@@ -111,10 +114,12 @@ def evaluate_single_journeys(
     """Figures over the landmarks of journeys; `truths` in the same order."""
     config = config or SingleJourneyConfig()
     samples = survey_samples(survey, config.lanes.step_m)
-    parts = [
-        _evaluate_one(one, truth, survey, samples, config)
-        for one, truth in zip(landmarks, truths, strict=True)
-    ]
+
+    def part(of: tuple[JourneyLandmarks, JourneyTruth]) -> _Part:
+        return _evaluate_one(*of, survey, samples, config)
+
+    device = samples.point_world.device
+    parts = list(in_order(part, list(zip(landmarks, truths, strict=True)), device))
     if not parts:
         raise ValueError("no journey to evaluate: expected at least one with landmarks and truth")
 
@@ -205,6 +210,24 @@ def nearest_seeing_frame(
     the view that counts; the nearest frame of all stands in where no frame within `range_m` has
     the point in its image.
     """
+    near = _nearest_frame(truth, point_world, range_m / _NEAR)
+    # Most points are seen from near; no frame beyond is nearer, or seen from nearer, than one within.
+    left = (~near.visible).nonzero()[:, 0]
+    far = _nearest_frame(truth, point_world[left], range_m)
+    return near.frame.index_put((left,), far.frame)
+
+
+@dataclass(frozen=True)
+class _Nearest:
+    """For each point the nearest frame that sees it; the nearest of all where none does, 0 where none is near."""
+
+    frame: Int[Tensor, " n"]
+    visible: Bool[Tensor, " n"]
+
+
+def _nearest_frame(
+    truth: JourneyTruth, point_world: Float[Tensor, "n 3"], range_m: float
+) -> _Nearest:
     T_camera_world = se3.inverse(truth.journey.T_world_camera)
     position = truth.journey.T_world_camera[:, :3, 3]
     point, frame, distance = pairs_between(point_world, position, radius=range_m)
@@ -214,5 +237,9 @@ def nearest_seeing_frame(
     # those is left otherwise.
     cost = torch.where(visible, distance, distance + 10 * range_m)
     points, group = point.unique(return_inverse=True)
-    closest = torch.zeros(len(point_world), dtype=torch.int64, device=point_world.device)
-    return closest.index_put((points,), frame[group_argmin(cost, group)])
+    best = group_argmin(cost, group)
+    none = torch.zeros(len(point_world), dtype=torch.int64, device=point_world.device)
+    return _Nearest(
+        frame=none.index_put((points,), frame[best]),
+        visible=none.bool().index_put((points,), visible[best]),
+    )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from crowdmap_torch import __version__
 from crowdmap_torch.config import MapperConfig, dump
-from crowdmap_torch.evaluation.evaluate import control_ids_of, evaluate_map, refuse_other_origin
+from crowdmap_torch.evaluation.evaluate import Against, evaluate_map, refuse_other_origin
 from crowdmap_torch.evaluation.evidence import read_journey_landmarks
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.io.atomic import atomic_file, atomic_folder, drop_halves
@@ -353,22 +353,14 @@ def read_truth_of(dataset_folder: Path, dataset: Dataset, survey: Survey | None)
 
 
 def figures_of(
-    hd_map: HdMap,
-    survey: Survey,
-    truth: Truth | None,
-    run: Path | None,
-    control: Survey | None = None,
+    hd_map: HdMap, survey: Survey, truth: Truth | None, run: Path | None, asked: Against
 ) -> MapFigures:
-    """METRICS.md's figures of a map; with a run's folder those of associations and single journeys too.
-
-    Signs that were `control` points are left out.
-    """
-    known = () if control is None else control_ids_of(control, survey)
+    """METRICS.md's figures of a map; with a run's folder those of associations and single journeys too."""
     if truth is None:
         note = "no truth with the survey: every surveyed sign is observable"
-        return evaluate_map(hd_map, survey, control_ids=known, notes=(note,))
+        return evaluate_map(hd_map, survey, notes=(note,), asked=asked)
     if run is None:
-        return evaluate_map(hd_map, survey, truth=truth, control_ids=known)
+        return evaluate_map(hd_map, survey, truth=truth, asked=asked)
     ids = [t.journey.journey_id for t in truth.journeys]
     return evaluate_map(
         hd_map,
@@ -376,5 +368,5 @@ def figures_of(
         truth=truth,
         associations=read_associations(run / "associations.parquet", ids),
         landmarks=read_journey_landmarks(run, ids),
-        control_ids=known,
+        asked=asked,
     )

@@ -85,6 +85,16 @@ def test_control_signs_are_left_out(build, simulated):
         evaluate_map(build.hd_map(true), survey, control_ids=("s9",))
 
 
+def test_what_is_asked_of_a_map_may_be_known(build, simulated):
+    true, _, survey, truth = simulated
+    hd_map = build.hd_map(true)
+    asked = against(survey, truth=truth, control_ids=("s1",))
+    known = evaluate_map(hd_map, survey, truth=truth, asked=asked)
+    assert (
+        known.as_dict() == evaluate_map(hd_map, survey, truth=truth, control_ids=("s1",)).as_dict()
+    )
+
+
 def test_control_signs_are_known_by_id_or_by_place(build, simulated):
     true, _, survey, _ = simulated
     control = replace(build.survey(build.moved(true, (0.05, 0, 0))), sign_id=("s0", "other", "far"))
