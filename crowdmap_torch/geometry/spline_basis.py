@@ -14,11 +14,13 @@ splines to points, `spline_length` measures along them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+_Four = tuple[Tensor, Tensor, Tensor, Tensor]
 _SOLVE_STEPS = 6
 """Of cyclic reduction: influence decays by 0.27 a knot, 2^6 knots away it is below rounding."""
 
@@ -44,8 +46,9 @@ def window(
     the last coefficient have weight 0 (do not read there: `window_flat` gives indices that are
     safe).
     """
-    start, weight, first, _ = window_with_curvature(t, count)
-    return start, weight, first
+    at = _place(t, count)
+    first = at.folded(at.slopes)
+    return at.start, at.folded(at.weights) + at.over[..., None] * first, first
 
 
 def window_with_curvature(
@@ -57,25 +60,59 @@ def window_with_curvature(
     Float[Tensor, "*batch 4"],
 ]:
     """As `window`, with the second derivatives of the weights too."""
+    at = _place(t, count)
+    first, second = at.folded(at.slopes), at.folded(at.curvatures)
+    # Straight on beyond the ends.
+    second = torch.where((at.over != 0)[..., None], 0.0, second)
+    return at.start, at.folded(at.weights) + at.over[..., None] * first, first, second
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where on its spline a point is: in which span, how far into it, and how far beyond the ends."""
+
+    u: Float[Tensor, "*batch"]
+    over: Float[Tensor, "*batch"]
+    start: Int[Tensor, "*batch"]
+    before: Bool[Tensor, "*batch"]
+    behind: Bool[Tensor, "*batch"]
+    shift: Int[Tensor, "*batch"]
+
+    @property
+    def weights(self) -> _Four:
+        """Of the coefficients around the span, those before and behind the spline too."""
+        u, v = self.u, 1 - self.u
+        uu, vv = u * u, v * v
+        return v * vv / 6, (4 - 3 * uu * (2 - u)) / 6, (4 - 3 * vv * (2 - v)) / 6, u * uu / 6
+
+    @property
+    def slopes(self) -> _Four:
+        """Their derivatives by t, ..."""
+        u, v = self.u, 1 - self.u
+        return -(v * v) / 2, u * (3 * u - 4) / 2, v * (4 - 3 * v) / 2, u * u / 2
+
+    @property
+    def curvatures(self) -> _Four:
+        """... and the second ones."""
+        u, v = self.u, 1 - self.u
+        return v, 3 * u - 2, 3 * v - 2, u
+
+    def folded(self, four: _Four) -> Float[Tensor, "*batch 4"]:
+        """The weights of the four slots that are read."""
+        return _folded(four, self.before, self.behind, self.shift)
+
+
+def _place(t: Float[Tensor, "*batch"], count: Int[Tensor, "*batch"] | int) -> _Place:
     last = torch.as_tensor(count, device=t.device) - 1
     inside = torch.minimum(t.clamp_min(0), last.to(t))
     span = torch.minimum(inside.detach().floor().long(), last - 1).clamp_min(0)
     u = inside - span
     over = t - inside
-    v = 1 - u
-    uu, vv = u * u, v * v
-    b = (v * vv / 6, (4 - 3 * uu * (2 - u)) / 6, (4 - 3 * vv * (2 - v)) / 6, u * uu / 6)
-    d = (-vv / 2, u * (3 * u - 4) / 2, v * (4 - 3 * v) / 2, uu / 2)
-    dd = (v, 3 * u - 2, 3 * v - 2, u)
-
     # Of the coefficients from span - 1 to span + 2 the first may be before the spline and the last behind it: such a ghost
     # is its neighbour twice, less the next. What is left of four begins one further on, or before.
     start = torch.minimum(span - 1, last - 3).clamp_min(0)
     before, behind, shift = span == 0, span == last - 1, start - span + 1
-    b, d, dd = (_folded(part, before, behind, shift) for part in (b, d, dd))
-    # Straight on beyond the ends.
-    outside = (over != 0)[..., None]
-    return start, b + over[..., None] * d, d, torch.where(outside, 0.0, dd)
+    return _Place(u, over, start, before, behind, shift)
 
 
 def _folded(
@@ -105,9 +142,15 @@ def window_flat(
     coefficients have weight 0.
     """
     start, weight, d_weight = window(t, count_of_spline)
-    slot = torch.arange(4, device=t.device)
+    return _rows_of(start, start_of_spline, count_of_spline), weight, d_weight
+
+
+def _rows_of(
+    start: Int[Tensor, " m"], start_of_spline: Int[Tensor, " m"], count_of_spline: Int[Tensor, " m"]
+) -> Int[Tensor, "m 4"]:
+    slot = torch.arange(4, device=start.device)
     rank = torch.minimum(start[:, None] + slot, count_of_spline[:, None] - 1)
-    return start_of_spline[:, None] + rank, weight, d_weight
+    return start_of_spline[:, None] + rank
 
 
 def to_coefficients_flat(
@@ -153,7 +196,8 @@ def evaluate_flat(
     spline: Int[Tensor, " m"],
 ) -> Float[Tensor, "m k"]:
     """Points at parameters t of packed splines; `spline` says which one each point is on."""
-    return _flat(control, count, t, spline, 1)
+    row, weight, _ = window_flat(t, starts(count)[spline], count[spline])
+    return _summed(row, weight, to_coefficients_flat(control, count))
 
 
 def derivative_flat(
@@ -163,13 +207,16 @@ def derivative_flat(
     spline: Int[Tensor, " m"],
 ) -> Float[Tensor, "m k"]:
     """Derivatives by t of packed splines; `spline` says which one each point is on."""
-    return _flat(control, count, t, spline, 2)
+    of_spline = count[spline]
+    at = _place(t, of_spline)
+    row = _rows_of(at.start, starts(count)[spline], of_spline)
+    return _summed(row, at.folded(at.slopes), to_coefficients_flat(control, count))
 
 
-def _flat(control: Tensor, count: Tensor, t: Tensor, spline: Tensor, part: int) -> Tensor:
-    windows = window_flat(t, starts(count)[spline], count[spline])
-    coefficient = to_coefficients_flat(control, count)
-    return (windows[part][..., None] * coefficient[windows[0]]).sum(-2)
+def _summed(
+    row: Int[Tensor, "m 4"], weight: Float[Tensor, "m 4"], coefficient: Float[Tensor, "c k"]
+) -> Float[Tensor, "m k"]:
+    return (weight[..., None] * coefficient[row]).sum(-2)
 
 
 def _shifted(column: Tensor, step: int) -> Tensor:

@@ -26,8 +26,7 @@ _SAMPLE_ROUNDS = 4
 
 def arc_length_flat(control: Float[Tensor, "c k"], count: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Lengths of packed splines [m]."""
-    length, spline, _ = _part_lengths(control, count)
-    return length.new_zeros(len(count)).index_add(0, spline, length)
+    return _lengths(_part_lengths(control, count), count)
 
 
 def parameter_at_length_flat(
@@ -37,7 +36,17 @@ def parameter_at_length_flat(
     spline: Int[Tensor, " m"],
 ) -> Float[Tensor, " m"]:
     """Parameters, within 0 .. C - 1, at given lengths [m] from the starts of packed splines."""
-    part_length, part_spline, part_start = _part_lengths(control, count)
+    return _parameter_at_length(control, count, length, spline, _part_lengths(control, count))
+
+
+_Parts = tuple[Tensor, Tensor, Tensor]
+"""Length, spline and first parameter of each part of each span of packed splines, in order."""
+
+
+def _parameter_at_length(
+    control: Tensor, count: Tensor, length: Tensor, spline: Tensor, parts: _Parts
+) -> Tensor:
+    part_length, part_spline, part_start = parts
     # One running length over all splines; each starts where the one before ended.
     running = torch.cat((part_length.new_zeros(1), part_length.cumsum(0)))
     part_count = (count - 1) * _PARTS
@@ -66,25 +75,26 @@ def sample_flat(
     Returns the points, their parameters and the spline of each; those of one spline are adjacent
     and in order.
     """
-    length = arc_length_flat(control, count)
+    parts = _part_lengths(control, count)
+    length = _lengths(parts, count)
     # a trace less, so that ten metres are ten spans of a metre, whatever the rounding
     spans = (length / spacing - 1e-9).ceil().clamp_min(1).long()
-    point, t, spline, longest = _sample(control, count, length, spans)
+    point, t, spline, longest = _sample(control, count, length, spans, parts)
     for _ in range(_SAMPLE_ROUNDS):
         # Where a spline all but stands still its length is known less well than elsewhere.
         over = longest > spacing * (1 + 1e-9)
         if not over.any():
             break
         spans = torch.where(over, (spans * longest / spacing).ceil().long() + 1, spans)
-        point, t, spline, longest = _sample(control, count, length, spans)
+        point, t, spline, longest = _sample(control, count, length, spans, parts)
     return point, t, spline
 
 
 def _sample(
-    control: Tensor, count: Tensor, length: Tensor, spans: Tensor
+    control: Tensor, count: Tensor, length: Tensor, spans: Tensor, parts: _Parts
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points, their parameters and splines, and the longest chord of each spline."""
-    t, spline = _even_parameters(control, count, length, spans + 1)
+    t, spline = _even_parameters(control, count, length, spans + 1, parts)
     point = evaluate_flat(control, count, t, spline)
     chord = (point[1:] - point[:-1]).square().sum(-1).sqrt()
     within = torch.where(spline[1:] == spline[:-1], chord, 0.0)
@@ -93,22 +103,26 @@ def _sample(
 
 
 def _even_parameters(
-    control: Tensor, count: Tensor, length: Tensor, number: Tensor
+    control: Tensor, count: Tensor, length: Tensor, number: Tensor, parts: _Parts
 ) -> tuple[Tensor, Tensor]:
     spline, rank = rows(number)
     last = number[spline] - 1
     along = length[spline] * rank / last.clamp_min(1)
-    t = parameter_at_length_flat(control, count, along, spline)
+    t = _parameter_at_length(control, count, along, spline, parts)
     # The ends exactly.
     end = (count[spline] - 1).to(t)
     return torch.where(rank == 0, 0.0, torch.where(rank == last, end, t)), spline
 
 
-def _part_lengths(control: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Length, spline and first parameter of each part of each span of packed splines, in order."""
+def _part_lengths(control: Tensor, count: Tensor) -> _Parts:
     spline, rank = rows((count - 1) * _PARTS)
     start = rank.to(control) / _PARTS
     return _length_between(control, count, start, start + 1 / _PARTS, spline), spline, start
+
+
+def _lengths(parts: _Parts, count: Tensor) -> Tensor:
+    length, spline, _ = parts
+    return length.new_zeros(len(count)).index_add(0, spline, length)
 
 
 def _length_between(
