@@ -23,6 +23,7 @@ from crowdmap_torch.crowd_lanes.line_samples import (
     along_axis,
     scalar_key,
 )
+from crowdmap_torch.processes.threads import in_order
 from crowdmap_torch.tables import Rows, concatenate
 
 _PAIRS_AT_ONCE = 500_000
@@ -125,14 +126,17 @@ def shift_to_ridges(
     reach = config.window + 4 * config.bandwidth
     tree = KDTree(_squeezed(samples.point, config, reach))
     place = _squeezed(points.point, config, reach)
-    parts = []
     few = place[:: max(1, len(place) // 256)]
     crowd = tree.query_ball_point(few, reach, return_length=True).mean()
     at_once = max(1, int(_PAIRS_AT_ONCE / max(crowd, 1.0)))
-    for rows in torch.arange(len(points), device=points.point.device).split(at_once):
+
+    def moved(rows: Int[Tensor, " r"]) -> RidgePoints:
         pairs = _pairs(samples, tree, place[rows.cpu().numpy()], reach)
-        parts.append(_shift(points[rows], samples, pairs, config, iterations))
-    return concatenate(parts)
+        return _shift(points[rows], samples, pairs, config, iterations)
+
+    device = points.point.device
+    lots = torch.arange(len(points), device=device).split(at_once)
+    return concatenate(tuple(in_order(moved, lots, device, worth=1)))
 
 
 def _squeezed(
