@@ -30,6 +30,8 @@ _CHI95 = 7.815**0.5
 _LANE_STEP_M = 1.0
 _NEAR_M = 20.0
 """How far the eye is from the middle at least."""
+_AWAY = 1.6
+"""How far, in lengths of the map: it shares the window with a picture and panels."""
 _PLATES = {
     "octagon": 0xC3202FFF,
     "triangle": 0xE8505CFF,
@@ -54,6 +56,7 @@ def write_recording(path: Path, scene: Scene) -> None:
     with atomic_file(path) as beside:
         stream = rerun.RecordingStream("crowdmap_torch")
         stream.save(beside, default_blueprint=_layout(rerun, scene))
+        stream.send_recording_name(scene.title)
         try:
             _Recorder(rerun, stream).record(scene)
         finally:
@@ -69,14 +72,14 @@ def rerun_sdk() -> ModuleType:
 
 
 def _layout(rerun: ModuleType, scene: Scene):
-    """The world, from above, beside the picture of the first drive."""
+    """The world, from above, beside the picture of the first drive; all drives begin at once, days lie between them."""
     of = rerun.blueprint
     views = [of.Spatial3DView(origin="world", name="map", eye_controls=_eye(rerun, scene))]
     if scene.journeys:
         first = scene.journeys[0].journey_id
         origin = rerun.new_entity_path([*_of_drive(first), "camera"])
         views.append(of.Spatial2DView(origin=origin, name=first))
-    return of.Blueprint(of.Horizontal(*views))
+    return of.Blueprint(of.Horizontal(*views), of.TimePanel(timeline="driven"))
 
 
 def _eye(rerun: ModuleType, scene: Scene):
@@ -88,7 +91,7 @@ def _eye(rerun: ModuleType, scene: Scene):
     if not len(points):
         return None
     low, high = points.amin(0), points.amax(0)
-    middle, away = (low + high) / 2, max(float((high - low)[:2].max()), _NEAR_M)
+    middle, away = (low + high) / 2, max(_AWAY * float((high - low)[:2].max()), _NEAR_M)
     eye = middle + away * torch.tensor([0.0, -0.4, 0.9], dtype=torch.double)
     return rerun.blueprint.EyeControls3D(
         position=eye.tolist(), look_target=middle.tolist(), eye_up=(0.0, 0.0, 1.0)
