@@ -14,8 +14,12 @@ from html import escape
 WIDTH, HEIGHT = 360, 220
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 8, 8, 36
 _MOST_POINTS = 2 * WIDTH
+_MOST_DIGITS = 4.5
+"""Of a number on the axis, between its label and its line."""
 _MOST_LETTERS = 7
 """Of a name on the axis."""
+_HALF_LETTER = 3.4
+"""Half the width of a letter."""
 SERIES = ("map", "before", "survey", "violet", "bad", "teal", "soft")
 """Colours of several lines: names of variables of the page's style."""
 
@@ -188,15 +192,29 @@ class _Axis:
         if self.names:
             return list(enumerate(_told_apart(self.names)))
         if self.log:
-            return [(v, f"{v:g}") for v in _log_ticks(low, high, most)]
+            found = _log_ticks(low, high, most)
+            return [*zip(found, _written([f"{v:g}" for v in found], found), strict=True)]
         raw = (high - low) / most
         power = 10.0 ** math.floor(math.log10(raw))
         step = next(power * k for k in (1, 2, 5, 10) if power * k >= raw * 0.999)
         first = math.ceil(low / step - 1e-9)
         digits = max(-math.floor(math.log10(step) + 1e-9), 0)
-        return [
-            (k * step, f"{k * step:,.{digits}f}") for k in range(first, int(high / step + 1e-9) + 1)
-        ]
+        found = [k * step for k in range(first, int(high / step + 1e-9) + 1)]
+        return [*zip(found, _written([f"{v:,.{digits}f}" for v in found], found), strict=True)]
+
+
+def _written(words: list[str], values: Sequence[float]) -> list[str]:
+    """Numbers of an axis as they are, or in thousands or millions where they would reach the axis' own label."""
+    for unit, letter in ((1e3, "k"), (1e6, "M")):
+        if max(map(_letters, words), default=0) <= _MOST_DIGITS or max(map(abs, values)) < unit:
+            break
+        words = [f"{v / unit:g}{letter if v else ''}" for v in values]
+    return words
+
+
+def _letters(number: str) -> float:
+    """How wide a number is, in digits."""
+    return sum(0.5 if c in ".,-" else 1.0 for c in number)
 
 
 def _told_apart(names: Sequence[str]) -> list[str]:
@@ -225,6 +243,7 @@ def _grid(across: _Axis, up: _Axis, chart: Chart) -> Iterator[str]:
     for value, name in across.ticks():
         x = across(value)
         yield f'<path class="grid" d="M{x:.1f} {_TOP}V{up.low_px}"/>'
+        x = min(x, WIDTH - _HALF_LETTER * len(name))
         yield f'<text x="{x:.1f}" y="{up.low_px + 14}" text-anchor="middle">{escape(name)}</text>'
     for value, name in up.ticks():
         y = up(value)

@@ -34,12 +34,14 @@ _MOST_CORNERS = 200_000
 def error_charts(
     now: SignComparison, before: SignComparison | None, *, oracle_m: float
 ) -> Iterator[Chart]:
-    """Histograms of the absolute and the relative error of signs."""
+    """Histograms of the absolute and the relative error of signs; of those alone that some sign has."""
     for name in ("absolute", "relative"):
         map_m = sign_errors(now, name)
         heads_m = sign_errors(before, name) if before is not None else map_m[:0]
         both = torch.cat((map_m, heads_m))
-        top = max(float(both.max()) * 1.02 if len(both) else 1.0, 1e-3)
+        if not len(both):
+            continue
+        top = max(float(both.max()) * 1.02, 1e-3)
         bars = []
         for values, color, label in ((heads_m, "before", "cluster heads"), (map_m, "map", "map")):
             count, edge = np.histogram(values.cpu().numpy(), _BINS, (0, top))

@@ -77,6 +77,27 @@ def test_ticks_are_round_and_told_apart():
     assert len(numbers) == len(set(numbers)) >= 6 and all(len(n) <= 6 for n in numbers)
 
 
+@pytest.mark.parametrize("log", [False, True])
+@pytest.mark.parametrize("most", [19_000.0, 4.2e6])
+def test_large_numbers_stay_beside_the_label_of_their_axis(most: float, log: bool):
+    """In thousands or millions; the label's letters end 14 units from the left."""
+    chart = Chart("", [Dots([0, 1], [most / 8, most])], y_label="cost", log_y=log)
+    ends = [t for t in drawn(chart).iter("text") if t.attrib["text-anchor"] == "end"]
+    assert len(ends) >= 2
+    for text in ends:
+        word = text.text or ""
+        letters, points = len(word), word.count(".") + word.count(",")
+        assert float(text.attrib["x"]) - 6.3 * (letters - points) - 3 * points > 14, word
+        value = float(word.rstrip("kM").replace(",", "")) * {"k": 1e3, "M": 1e6}.get(word[-1], 1.0)
+        assert value == 0 or most / 10 <= value <= 1.2 * most
+
+
+def test_the_last_number_of_an_axis_is_inside_the_chart():
+    text = svg(Chart("", [Dots([0, 100], [0, 1])], x_range=(0, 100)))
+    (x,) = re.findall(r'<text x="([\d.]+)"[^>]*>100</text>', text)
+    assert float(x) + 3.4 * len("100") <= WIDTH
+
+
 def test_names_are_cut_to_what_tells_them_apart():
     names = ["2026-05-01-van", "2026-05-02-van", "2026-05-02-very-long"]
     text = svg(Chart("", [Dots([1, 2, 3], [0, 1, 2])], y_names=names))
