@@ -75,6 +75,7 @@ p.note { color:var(--soft); margin:2px 0 12px; font-size:14px; max-width:80ch; }
 .card b small { font-size:14px; font-weight:500; color:var(--soft); margin-left:3px; }
 .card span { color:var(--soft); font-size:13px; }
 .sortable td.text { white-space:nowrap; }
+.sortable td.code { white-space:normal; overflow-wrap:break-word; }
 table.sortable { font-size:13px; }
 .sortable th,.sortable td { padding:5px 6px; }
 .card i { display:block; font-style:normal; font-size:12.5px; color:var(--soft); margin-top:2px; }

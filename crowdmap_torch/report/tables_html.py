@@ -176,7 +176,7 @@ def sign_table(record: RunRecord) -> str:
         cells = [
             _cell(hd_map.sign_id[k], hd_map.sign_id[k]),
             _cell(polygon.SHAPES[shape[k]].replace("_", " "), shape[k], kind="text"),
-            _cell(name, name, kind="text"),
+            _cell(name, name, kind="text code"),
             *(_cell(f"{v:.2f}", v) for v in (*center[k], *size[k])),
             *(_cell(f"{n:,}", n) for n in counts[k]),
             *(_cell(f"{v:.3f}", v) for v in (sigma[k], confidence[k])),

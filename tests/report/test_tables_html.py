@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import torch
 
+from crowdmap_torch.report.assets import STYLE
 from crowdmap_torch.report.summaries import JourneySummary, Pruned
 from crowdmap_torch.report.tables_html import (
     bias_table,
@@ -49,6 +50,13 @@ def test_every_sign_is_a_row_that_says_what_it_is_to_the_survey(record):
     errors = [float(row[head.index("error")]) for row in rows]
     mean = record.figures.signs.absolute.total.mean
     assert abs(sum(errors) / len(errors) - mean) < 1e-3
+
+
+def test_names_of_signs_may_break_and_no_number_does(record):
+    """As Mapillary names signs, they are as long as five columns of numbers."""
+    assert ".sortable td.code { white-space:normal;" in STYLE
+    row = re.findall(r"<tr class=\"pick\".*?</tr>", sign_table(record))[0]
+    assert row.count('class="text code"') == 1
 
 
 def test_without_a_survey_signs_have_no_errors(record):

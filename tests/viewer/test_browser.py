@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,28 @@ def test_a_narrow_page_does_not_scroll_sideways(page: Page, file: Path) -> None:
     show(page, file, 400, 800)
     page.ask(f"{V}.chooseSign('a&b')")
     assert page.ask("document.documentElement.scrollWidth") <= 400
+
+
+@pytest.mark.parametrize("width", [400, 1200])
+def test_long_names_of_signs_leave_room_for_numbers(
+    page: Page, scene: Scene, tmp_path: Path, width: int
+) -> None:
+    """Names as Mapillary has them, in the list of a map that a survey is beside."""
+    assert scene.hd_map is not None
+    names = tuple(f"regulatory--no-{k}-turn-on-red--g{k}" for k in ("left", "right", "u"))
+    kinds = scene.hd_map.signs.type.new_tensor([k % 3 for k in range(len(scene.hd_map.signs))])
+    hd_map = replace(
+        scene.hd_map,
+        signs=replace(scene.hd_map.signs, type=kinds),
+        sign_id=tuple(f"sign-7b1a2d01b95{k}" for k in range(len(kinds))),
+        type_names=names,
+    )
+    path = tmp_path / "view.html"
+    write_page(path, replace(scene, hd_map=hd_map, outcomes=None))
+    show(page, path, width)
+    assert names[0] in page.ask("document.querySelector('.cmv-list').textContent")
+    cut = "(() => { const l = document.querySelector('.cmv-list'); return l.scrollWidth - l.clientWidth; })()"
+    assert page.ask(cut) <= 0
 
 
 def test_frames_of_a_data_set_are_gone_through(page: Page, tiny: Dataset, tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ class Panel {
     });
     const rows = this.found.slice(0, most).map((row) => h('tr', {
       'data-row': row.row, class: 'cmv-row', onclick: () => this.viewer.choose({ kind: kind.name, row: row.row }, { fly: true }),
-    }, kind.cells(row).map((cell, k) => h(k ? 'td' : 'th', k ? {} : { scope: 'row' },
+    }, kind.cells(row).map((cell, k) => h(k ? 'td' : 'th', k ? { class: /[a-z]/i.test(cell) ? 'cmv-word' : null } : { scope: 'row' },
       k ? String(cell) : h('button', { type: 'button', class: 'cmv-link', title: String(cell) }, String(cell))))));
     const told = this.filter ? `${plural(this.found.length, 'row')} of ${count(kind.rows.length)}` : `all ${kind.title.toLowerCase()}`;
     const table = h('table', {}, h('caption', {}, `${kind.title}: ${told}`),
