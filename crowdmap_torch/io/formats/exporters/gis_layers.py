@@ -19,6 +19,8 @@ _WKB = {"Point": 1001, "LineString": 1002, "Polygon": 1003}
 
 def write_layer(layer: Layer, path: Path, driver: str, *, append: bool = False) -> None:
     """Writes features into a file, a new one or as one more layer."""
+    # GDAL writes version 1.4, of which QGIS 3.22 warns that it may not read all of it.
+    options = {"VERSION": "1.3"} if driver == "GPKG" and not append else {}
     columns = {name: _column(values) for name, values in columns_of(layer).items()}
     pyogrio.raw.write(
         path,
@@ -31,6 +33,7 @@ def write_layer(layer: Layer, path: Path, driver: str, *, append: bool = False) 
         geometry_type=f"{layer.geometry} Z",
         crs=CRS,
         append=append,
+        dataset_options=options,
     )
 
 

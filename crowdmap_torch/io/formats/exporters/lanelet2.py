@@ -50,7 +50,8 @@ def write(hd_map: HdMap, path: Path) -> tuple[str, ...]:
     ways = carriageways(points, LONGEST)
     lines = [
         "<?xml version='1.0' encoding='UTF-8'?>",
-        f'<osm version="0.6" generator="crowdmap_torch {__version__}">',
+        # Numbers are the file's own: uploaded, they would take the place of elements of OpenStreetMap.
+        f'<osm version="0.6" generator="crowdmap_torch {__version__}" upload="never">',
         f"  <note>{escape(json_text({'crowdmap': head(hd_map)}))}</note>",
         *_elements(hd_map, points, ways),
         "</osm>",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import struct
+from contextlib import closing
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -100,3 +102,9 @@ def test_a_map_without_landmarks_is_written(form: str, road: HdMap, tmp_path: Pa
 def test_modules_are_there_for_every_format():
     for name in FORMATS:
         assert callable(import_module(f"crowdmap_torch.io.formats.exporters.{name}").write)
+
+
+def test_a_geopackage_is_of_a_version_that_older_programs_know(road: HdMap, tmp_path: Path):
+    export_map(road, tmp_path / "road.gpkg", "geopackage")
+    with closing(sqlite3.connect(tmp_path / "road.gpkg")) as file:
+        assert file.execute("pragma user_version").fetchone() == (10300,)

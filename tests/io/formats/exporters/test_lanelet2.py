@@ -86,6 +86,10 @@ def test_the_file_says_where_it_comes_from(road: HdMap, file: Path):
     assert told["origin"]["lat_deg"] == ORIGIN.lat_deg
 
 
+def test_editors_are_told_that_nothing_belongs_into_openstreetmap(file: Path):
+    assert ET.parse(file).getroot().attrib["upload"] == "never"
+
+
 def test_a_map_without_landmarks_is_a_file_without_elements(road: HdMap, tmp_path: Path):
     none = torch.empty(0, dtype=torch.int64)
     bare = replace(
