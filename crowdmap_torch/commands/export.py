@@ -1,8 +1,9 @@
-"""Writes a map in a format of others: `crowdmap export MAP --to FORMAT [-o FILE] [--overwrite]`.
+"""Writes a map in a format of others: `crowdmap export MAP --to FORMAT [-o FILE] [--bbox E0,N0,E1,N1] [--overwrite]`.
 
 MAP is a map, a survey whose signs have corners, or a RUN, whose map is taken; `tum` and `kitti` write the refined poses of a
 RUN, into a folder. What the format has no place for is said in a line each. `tiles` and `map` write FORMAT.md's own two
-forms of a map, with everything that is in it.
+forms of a map, with everything that is in it. With `--bbox` it is what lies in an area alone; of a map in tiles those are
+read that hold something there.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from crowdmap_torch.io.area import Area, read_area
 from crowdmap_torch.io.errors import InputError, input_read
 from crowdmap_torch.io.formats.exporters.export import (
     FORMATS,
@@ -20,9 +22,10 @@ from crowdmap_torch.io.formats.exporters.export import (
     form_of,
     names,
 )
-from crowdmap_torch.io.maps import read_map
+from crowdmap_torch.io.maps import read_map, write_map
 from crowdmap_torch.io.tiled_maps import DEFAULT_LEVEL, TileLevel, rewrite_map, tentative_count
 from crowdmap_torch.ranges import argument
+from crowdmap_torch.tables import HdMap
 
 _FORMS = {
     "tiles": ExportFormat("map in tiles", ".tiles", is_folder=True),
@@ -44,6 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "-o", "--out", type=Path, metavar="FILE", help="default: beside MAP, named after it"
+    )
+    parser.add_argument(
+        "--bbox",
+        type=_area,
+        metavar="E0,N0,E1,N1",
+        help="what lies in this area alone [m east and north of the origin]; markers that reach into it are whole",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a FILE that exists")
     parser.add_argument(
@@ -67,9 +76,9 @@ def run(options: argparse.Namespace) -> None:
     folder = _map_folder(options.map)
     out = options.out or folder.resolve().with_name(f"{folder.resolve().name}{form.ending}")
     _require_free(out, folder, form, options.overwrite)
+    hd_map = _read(folder, options.bbox)
     with input_read():
-        hd_map = read_map(folder)
-        left = tentative_count(folder)
+        left = 0 if options.bbox is not None else tentative_count(folder)
     losses = export_map(hd_map, out, options.to)
     print(f"{form.title}: {out}: {len(hd_map.signs)} signs, {len(hd_map.lanes)} lane pieces")
     if left:
@@ -82,8 +91,14 @@ def _run_form(options: argparse.Namespace, form: ExportFormat) -> None:
     folder = _map_folder(options.map)
     out = options.out or folder.resolve().with_name(f"{folder.resolve().name}{form.ending}")
     _require_free(out, folder, form, options.overwrite)
+    level = options.level if options.to == "tiles" else None
+    if options.bbox is not None:
+        hd_map = _read(folder, options.bbox)
+        write_map(hd_map, out, min_confidence=0.0, tile_level=level)
+        print(f"{form.title}: {out}: {len(hd_map.signs)} signs, {len(hd_map.lanes)} lane pieces")
+        print("left out: tentative signs, and columns that FORMAT.md does not know")
+        return
     with input_read():
-        level = options.level if options.to == "tiles" else None
         counts = rewrite_map(folder, out, level=level)
     told = [f"{count} {kind.replace('_', ' ')}" for kind, count in counts.items()]
     print(f"{form.title}: {out}: {', '.join(told)}")
@@ -92,7 +107,25 @@ def _run_form(options: argparse.Namespace, form: ExportFormat) -> None:
             print(f"left out: {path.name}, which is not part of the map")
 
 
+def _read(folder: Path, area: Area | None) -> HdMap:
+    """The map, or what of it lies in an area; InputError where nothing does."""
+    with input_read():
+        hd_map = read_map(folder, area=area)
+    if area is not None and not len(hd_map.signs) and not len(hd_map.lanes):
+        raise InputError(f"{folder}: nothing of it lies in the area {area}")
+    return hd_map
+
+
+def _area(text: str) -> Area:
+    try:
+        return read_area(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
 def _run_trajectories(options: argparse.Namespace, form: ExportFormat) -> None:
+    if options.bbox is not None:
+        raise InputError(f"--bbox is of maps; --to {options.to} writes the drives of a RUN whole")
     run = options.map.resolve()
     out = options.out or run.with_name(f"{run.name}{form.ending}")
     _require_free(out, run, form, options.overwrite)

@@ -13,6 +13,7 @@ import torch
 
 from crowdmap_torch.cli import main
 from crowdmap_torch.geometry import quadtree
+from crowdmap_torch.io.area import Area
 from crowdmap_torch.io.formats.geodesy import geodetic_from_local
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.tables import HdMap, Origin
@@ -127,6 +128,49 @@ def test_a_map_goes_into_tiles_and_back(
     assert main(to_tiles) == 2
     assert "exists" in capsys.readouterr().err
     assert main([*to_tiles, "--overwrite"]) == 0
+
+
+def test_a_part_by_its_area_is_read_from_its_tiles_alone(
+    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The quarter north-east of where four tiles meet: the same of either form, in every form."""
+    east, north = MIDDLE_M
+    area = ["--bbox", f"{east + 1},{north + 1},1000,1000"]
+    whole, tiled = runs[1] / "map", tmp_path / "tiled"
+    shutil.copytree(runs[0] / "map", tiled)
+    head = read_map(whole, area=Area(east + 1, north + 1, 1000, 1000))
+    assert 0 < len(head.signs) < len(read_map(whole).signs)
+    for to in ("map", "tiles"):
+        out = [tmp_path / f"{to}-{k}" for k in range(2)]
+        for source, part in zip((whole, tiled), out, strict=True):
+            assert main(["export", str(source), "--to", to, "-o", str(part), *area]) == 0
+            told = f"{len(head.signs)} signs, {len(head.lanes)} lane pieces"
+            assert told in capsys.readouterr().out
+            assert places(read_map(part)) == places(head)
+            assert torch.equal(read_map(part).signs.center_world, head.signs.center_world)
+    for source, name in ((whole, "a.geojson"), (tiled, "b.geojson")):
+        file = str(tmp_path / name)
+        assert main(["export", str(source), "--to", "geojson", "-o", file, *area]) == 0
+    ids = [
+        {
+            f["properties"]["sign_id"]
+            for f in json.loads((tmp_path / n).read_text())["features"]
+            if f["properties"]["layer"] == "signs"
+        }
+        for n in ("a.geojson", "b.geojson")
+    ]
+    assert ids[0] == ids[1] == set(head.sign_id)
+    capsys.readouterr()
+    nowhere = ["export", str(whole), "--to", "map", "-o", str(tmp_path / "none")]
+    for words, told in (
+        ([*nowhere, "--bbox", "5000,5000,6000,6000"], "nothing of it lies in the area"),
+        (["export", str(runs[1]), "--to", "tum", *area], "--bbox is of maps"),
+    ):
+        assert main(words) == 2
+        assert told in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*nowhere, "--bbox", "3,2,1"])
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_map_without_a_place_on_the_earth_has_no_tiles(

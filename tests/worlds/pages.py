@@ -13,7 +13,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 PROGRAMS = ("crowdmap", "make", "python", "tensorboard", "pip", "git")
 WORDS = {
     **{"NAME": "journeys", "FORMAT": "geojson", "ID": "journey-000"},
-    **{"NUMBER": "1", "N": "1", "S": "1"},
+    **{"NUMBER": "1", "N": "1", "S": "1", "E0,N0,E1,N1": "-500,-500,500,500"},
 }
 """What stands for a word that a reader replaces, where it may not be any text."""
 
