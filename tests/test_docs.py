@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -49,6 +50,19 @@ def test_nothing_outside_the_repository_is_cited():
     for path in (*SOURCES, *PAGES):
         if path != ROOT / "tests" / "conftest.py":
             assert not outside.search(text(path)), path
+
+
+def test_extras_that_are_told_of_are_there():
+    declared = tomllib.loads(text(ROOT / "pyproject.toml"))["project"]["optional-dependencies"]
+    rows = set(re.findall(r"^\| `(\w+)` \| ", text(ROOT / "README.md"), flags=re.M))
+    assert rows == declared.keys() - {"dev", "docs", "bench"}
+    named = {
+        extra
+        for path in (*SOURCES, *PAGES)
+        for group in re.findall(r"(?:crowdmap_torch|'\.|extra )\[([a-z,]+)\]", text(path))
+        for extra in group.split(",")
+    }
+    assert {"gis", "lanelet", "rerun", "ray"} <= named <= declared.keys()
 
 
 def test_terms_of_the_glossary_live_where_it_says():
