@@ -43,6 +43,9 @@ NOT_RUN: Mapping[str, str] = {
     "python scripts/soak.py signals": "maps for a minute; test_interrupted.py does the same by SIGKILL",
     "crowdmap optimize /data/city --out /data/run --engine ray --address FIRST:6379": "needs a cluster",
     "crowdmap optimize --engine ray --address HOST:PORT": "needs a cluster",
+    "ray start --head --port 6379 --num-cpus 16": "begins a cluster that outlives it",
+    "ray start --address FIRST:6379 --num-cpus 16": "needs a cluster",
+    "ray stop": "ends every cluster of the machine, ours or not",
     "pip install torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu": "needs a network",
     "pip install -c constraints.txt .": "needs a network",
 }
@@ -98,6 +101,7 @@ COMPLETED: Mapping[str, str] = {
     "crowdmap simulate --map": "crowdmap simulate SIMULATED --map MAP",
     f"{ERRORS} --errors NAME --error-factor N": f"{ERRORS} --errors mounts,clocks --error-factor 2",
     "crowdmap view": "crowdmap view RUN",
+    "python docs/concepts.py DATA RUN": "python docs/concepts.py ../DATASET ../RUN",
     "crowdmap view ... --rerun FILE.rrd": "crowdmap view RUN --rerun FILE.rrd",
 }
 """Where a page names a part of a command: the whole, as a reader would type it."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-PROGRAMS = ("crowdmap", "make", "python", "tensorboard", "pip", "git")
+PROGRAMS = ("crowdmap", "make", "python", "tensorboard", "pip", "git", "ray")
 WORDS = {
     **{"NAME": "journeys", "FORMAT": "geojson", "ID": "journey-000"},
     **{"NUMBER": "1", "N": "1", "S": "1", "E0,N0,E1,N1": "-500,-500,500,500"},
