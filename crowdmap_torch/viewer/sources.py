@@ -16,11 +16,12 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.found_calibration import folder_name
+from crowdmap_torch.io.map_heads import read_map_head
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.io.poses import LinkPoses, read_poses
 from crowdmap_torch.io.rigs import read_camera, read_rig
 from crowdmap_torch.io.sign_outcomes import read_sign_outcomes
-from crowdmap_torch.io.surveys import read_survey
+from crowdmap_torch.io.surveys import read_survey, survey_files
 from crowdmap_torch.tables import HdMap, Journey, Survey
 from crowdmap_torch.viewer.scene import Drive, Scene, scene_of_dataset
 
@@ -28,7 +29,7 @@ _POSES, _OUTCOMES = "poses.parquet", "sign_detections.parquet"
 
 
 def read_scene(path: Path, *, dataset: Path | None = None, survey: Path | None = None) -> Scene:
-    """What the folder `path` shows: a map, a RUN (or its map), or a data set; InputError for anything else.
+    """What the folder `path` shows: a map, a RUN (or its map), a survey, or a data set; InputError for anything else.
 
     A run's `dataset` adds the drives as they were given, and its survey; by default it is the one that the run
     remembers, if it is still there.
@@ -42,7 +43,10 @@ def read_scene(path: Path, *, dataset: Path | None = None, survey: Path | None =
         raise InputError(
             f"{path}: is no map, run or data set; expected a folder with map.json, map/map.json or dataset.json"
         )
-    hd_map = read_map(path)
+    try:
+        hd_map = read_map(path)
+    except InputError as error:
+        return _only_surveyed(path, error)
     return Scene(
         kind="map",
         title=_name(path),
@@ -50,6 +54,25 @@ def read_scene(path: Path, *, dataset: Path | None = None, survey: Path | None =
         origin=hd_map.origin,
         hd_map=hd_map,
         survey=None if survey is None else _survey(survey, hd_map),
+    )
+
+
+def _only_surveyed(path: Path, error: InputError) -> Scene:
+    """A survey that is no map as it has signs of which the centre alone is known, or one of its files; else `error`."""
+    survey = read_survey(path)
+    bare, half = (
+        int((~survey.signs.has_corners).sum()),
+        None in survey_files(path, read_map_head(path)),
+    )
+    if not bare and not half:
+        raise error
+    told = f"a survey: of {bare} of its {len(survey.sign_id)} signs the centre alone is known"
+    return Scene(
+        kind="map",
+        title=_name(path),
+        origin=survey.origin,
+        survey=survey,
+        notes=(told,) if bare else (),
     )
 
 

@@ -4,6 +4,8 @@ import json
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -40,6 +42,34 @@ def test_a_map_alone_is_a_map(run_folder: Path, tmp_path: Path) -> None:
     shutil.copytree(run_folder / "map", tmp_path / "alone")
     scene = read_scene(tmp_path / "alone")
     assert scene.kind == "map" and scene.drives == () and scene.outcomes is None
+
+
+def test_a_survey_whose_signs_are_places_alone_is_shown(run_folder: Path, tmp_path: Path) -> None:
+    """As a Lanelet2 map of others gives it: the centres of its signs, or lanes and no file of signs."""
+    places = tmp_path / "places"
+    shutil.copytree(run_folder / "map", places)
+    table = pq.read_table(places / "signs.parquet")
+    nothing = pa.nulls(len(table), table.schema.field("corners").type)
+    at = table.column_names.index("corners")
+    pq.write_table(table.set_column(at, "corners", nothing), places / "signs.parquet")
+    scene = read_scene(places)
+    assert scene.hd_map is None and scene.survey is not None
+    assert len(scene.survey.sign_id) == len(table)
+    assert any("the centre alone is known" in note for note in scene.notes)
+    (places / "signs.parquet").unlink()
+    scene = read_scene(places)
+    assert scene.survey is not None and scene.survey.lane_id and not scene.survey.sign_id
+
+
+def test_a_map_that_is_broken_is_not_taken_for_a_survey(run_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(run_folder / "map", tmp_path / "broken")
+    path = tmp_path / "broken" / "signs.parquet"
+    table = pq.read_table(path)
+    wrong = pa.array([-1.0] * len(table), table.schema.field("confidence").type)
+    at = table.column_names.index("confidence")
+    pq.write_table(table.set_column(at, "confidence", wrong), path)
+    with pytest.raises(InputError, match="confidence"):
+        read_scene(tmp_path / "broken")
 
 
 def test_a_data_set_shows_its_drives(tiny_folder: Path, tiny: Dataset) -> None:

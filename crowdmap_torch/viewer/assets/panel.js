@@ -144,6 +144,7 @@ class Panel {
       parts.push(plural(model.signs.length, 'sign'), plural(model.lanes.length, 'lane marker'));
     }
     if (model.drives.length) parts.push(plural(model.drives.length, 'drive'));
+    if (!parts.length) parts.push(plural(model.survey.length, 'surveyed sign'), plural(model.surveyLanes.length, 'surveyed marker'));
     const told = [h('p', {}, parts.join(', ') + '.')];
     if (head.drawn && head.drawn[0] < head.drawn[1]) {
       const what = model.kind === 'run' ? 'detections of its signs' : 'frames';
