@@ -1,6 +1,7 @@
 """What mkdocs needs beside mkdocs.yml: the pages of the repository's root, and links between them and those of docs/.
 
-Links to what is no page (sources, configurations) become plain text: the site stands by itself.
+Links to what is no page (sources, configurations) become plain text: the site stands by itself. Lists and tables may follow
+a line of text at once, as elsewhere; to mkdocs they would be a part of it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ FROM_ROOT = {
     "CHANGELOG.md": "CHANGELOG.md",
 }
 """Pages of the root by their names on the site, where a README.md would take the place of index.md."""
+_BLOCKS = {"list": re.compile(r"- |\d+\. "), "table": re.compile(r"\|")}
+"""How their lines begin."""
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -29,7 +32,22 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """A page with its links as the site has them."""
-    return with_links(markdown, page.file.src_uri, {file.src_uri for file in files})
+    return with_links(set_off(markdown), page.file.src_uri, {file.src_uri for file in files})
+
+
+def set_off(markdown: str) -> str:
+    """The text with an empty line before every list and table; what stands in fences stays."""
+    lines, inside, kind = [], False, ""
+    for line in markdown.splitlines():
+        if line.startswith("```"):
+            inside = not inside
+        began = "" if inside else next((k for k, v in _BLOCKS.items() if v.match(line)), "")
+        if began and began != kind and lines and lines[-1].strip():
+            lines.append("")
+        # What is indented goes on with a list's last item.
+        kind = began or (kind if line.startswith("  ") else "")
+        lines.append(line)
+    return "\n".join(lines) + "\n"
 
 
 def with_links(markdown: str, name: str, known: set[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -26,6 +27,14 @@ def test_links_between_docs_and_the_root_lead_to_pages():
     assert site_pages.with_links(said, "FIRST_MAP.md", KNOWN) == (
         "![m](map.png) [b](FORMAT.md#y) l [p](#part)"
     )
+
+
+def test_lists_and_tables_are_set_off_from_text():
+    said = "a\nb\n- one\n  more\n- two\n\nc\n| t |\n| - |\n```\nd\n- e\n```\n"
+    assert site_pages.set_off(said) == (
+        "a\nb\n\n- one\n  more\n- two\n\nc\n\n| t |\n| - |\n```\nd\n- e\n```\n"
+    )
+    assert site_pages.set_off(site_pages.set_off(said)) == site_pages.set_off(said)
 
 
 def test_every_page_is_in_the_navigation():
@@ -53,6 +62,10 @@ def test_the_site_is_built_without_a_complaint(tmp_path: Path):
     site = tmp_path / "site"
     assert 'id="where-to-go"' in (site / "index.html").read_text("utf-8")
     assert "<title>First map" in (site / "FIRST_MAP.html").read_text("utf-8")
+    for page in site.glob("*.html"):
+        words = re.sub(r"<pre.*?</pre>|<code>.*?</code>", "", page.read_text("utf-8"), flags=re.S)
+        told = "\n".join(re.findall(r"<p>(.*?)</p>", words, flags=re.S))
+        assert not re.search(r"^(- |\d+\. |\| )", told, flags=re.M), page.name
     api = (site / "API.html").read_text("utf-8")
     assert "build_map" in api and "crowdmap_torch.mapper" in api
     assert "http://fonts" not in api and "https://fonts" not in api
