@@ -248,9 +248,11 @@ def _column_type(task: Task) -> Changed | None:
     try:
         if pa.types.is_floating(column.type) and pa.types.is_integer(wanted):
             values = column.to_numpy()
-            if not (np.isfinite(values) & (values == np.rint(values))).all():
+            # Many writers have no whole numbers beside an unknown one, and make it NaN: here a null.
+            unknown = np.isnan(values) & (name in _NULLABLE)
+            if not (unknown | (np.isfinite(values) & (values == np.rint(values)))).all():
                 return None
-            column = pa.array(values.astype(np.int64))
+            column = pa.array(np.where(unknown, 0, values).astype(np.int64), mask=unknown)
         else:
             column = column.cast(wanted)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
@@ -261,6 +263,8 @@ def _column_type(task: Task) -> Changed | None:
 
 _WHOLE = ("frame", "t_ns", "track")
 """Columns of whole numbers."""
+_NULLABLE = ("track",)
+"""Those of them that need not be known."""
 _TYPE_NAMES = {pa.int64(): "int64", pa.float64(): "float64", pa.list_(pa.float64()): "list<double>"}
 
 _OF_POSES = {

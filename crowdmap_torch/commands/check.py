@@ -64,7 +64,8 @@ def run(options: argparse.Namespace) -> int:
         if mended is None:
             print(f"nothing to put right: {options.fix} is not written")
         else:
-            print(f"{options.fix}: written anew, with")
+            told = "with" if mended.changes else "and nothing of it could be put right"
+            print(f"{options.fix}: written anew, {told}")
             for line in mended.changes:
                 print(f"  {line}")
             check = mended.check

@@ -6,6 +6,9 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from crowdmap_torch.checking import repair
@@ -46,10 +49,29 @@ def test_what_rounding_has_lost_is_told_and_not_taken_for_another_mistake(
     assert grave(mended.check) == {"rounded-rotations"}
 
 
-def _scaled(folder: Path, factor: float) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+def test_tracks_that_a_writer_made_fractions_of_are_whole_again(
+    drives: Dataset, winding_pair: Path, tmp_path: Path
+) -> None:
+    """As data frames have whole numbers of which one is unknown: NaN, and all of them double."""
+    bad = Path(shutil.copytree(winding_pair, tmp_path / "bad"))
+    for path in bad.glob("journeys/*/signs.parquet"):
+        table = pq.read_table(path)
+        track = np.arange(len(table), dtype=float)
+        track[::3] = np.nan
+        at = table.column_names.index("track")
+        pq.write_table(table.set_column(at, "track", pa.array(track)), path)
+    mended = write_repaired(bad, tmp_path / "new", check_dataset(bad))
+    assert mended.check.is_sound, mended.check.items
+    for path in (tmp_path / "new").glob("journeys/*/signs.parquet"):
+        track = pq.read_table(path)["track"]
+        assert track.type == pa.int64()
+        known = np.arange(len(track)) % 3 > 0
+        assert track.is_valid().to_pylist() == known.tolist()
+        assert track.drop_null().to_pylist() == np.flatnonzero(known).tolist()
+    assert is_near(differences(drives, mended.check.dataset), "row-by-row")
 
+
+def _scaled(folder: Path, factor: float) -> None:
     for path in folder.glob("journeys/*/poses.parquet"):
         table = pq.read_table(path)
         for name in "xyz":
