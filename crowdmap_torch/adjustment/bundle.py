@@ -145,7 +145,7 @@ class Bundle(nn.Module):
         )
         self.register_buffer("white_scale", torch.ones_like(values["bias"][:, :2]))
         self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
-        self.register_buffer("poses_left", torch.zeros_like(self.delta_pose.detach()))
+        self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
         self.register_buffer("told_at", torch.full_like(self._scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points

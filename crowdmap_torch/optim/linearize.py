@@ -234,7 +234,8 @@ def autograd_jacobians(
     blocks = [block.detach().requires_grad_() for block in arguments[: len(kinds)]]
     with torch.enable_grad():
         residual = _evaluate(term, (*blocks, *arguments[len(kinds) :]))
-        numbers = residual.unbind(0) if residual.requires_grad else ()
+        # Sums: to be given ones for each row, autograd would import sympy, half a second.
+        numbers = residual.sum(1).unbind(0) if residual.requires_grad else ()
     by_number = [_by_blocks(number, blocks) for number in numbers]
     jacobians = [
         _pulled_back(kind, block.detach(), torch.stack(by_block))
@@ -243,11 +244,9 @@ def autograd_jacobians(
     return residual.detach(), tuple(jacobians)
 
 
-def _by_blocks(number: Float[Tensor, " m"], blocks: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """The derivatives of one number of every row by its blocks."""
-    found = torch.autograd.grad(
-        number, blocks, torch.ones_like(number), retain_graph=True, allow_unused=True
-    )
+def _by_blocks(number: Float[Tensor, ""], blocks: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """The derivatives of one number's sum over all rows by the blocks: of every row by its own ones."""
+    found = torch.autograd.grad(number, blocks, retain_graph=True, allow_unused=True)
     return tuple(
         torch.zeros_like(block) if x is None else x for x, block in zip(found, blocks, strict=True)
     )
