@@ -21,6 +21,8 @@ from crowdmap_torch.optim.solvers.normal_equations import Backend, NormalEquatio
 from crowdmap_torch.ranges import Damping, Factor, RoundsOrNone, Settings, Share
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE, CONVERGED_MOVE = range(6)
+_UNDAMPED = 1e-6
+"""Steps that are damped by more are short by themselves: they say nothing of how far the minimum is."""
 _NEAR_BEST = 0.2
 """Steps that should be longer or shorter by less than this share stay as they are."""
 REASONS = (
@@ -147,6 +149,7 @@ def step(
     nothing_left = proposal.solved & ~accepted & (proposal.predicted <= 1e-3 * tolerance)
     reason[running & ((accepted & (decrease <= tolerance)) | nothing_left)] = CONVERGED_COST
     lost = accepted & (proposal.in_sigmas * length < config.move_tolerance)
+    lost &= state.damping <= _UNDAMPED
     reason[running & lost & (reason == RUNNING)] = CONVERGED_MOVE
     tiny = proposal.solved & (proposal.norm < config.step_tolerance)
     reason[running & tiny & (reason == RUNNING)] = CONVERGED_STEP

@@ -76,7 +76,7 @@ def test_the_cost_never_rises():
 def test_a_step_that_is_lost_in_how_little_is_known_is_the_last():
     problem, true = curves(20, outliers=True)
     exact = lm.solve(problem, {"x": true + 0.02}, lm.LmConfig(cost_tolerance=1e-12))
-    config = lm.LmConfig(cost_tolerance=0.0, move_tolerance=0.1)
+    config = lm.LmConfig(cost_tolerance=0.0, move_tolerance=0.1, initial_damping=1e-9)
     early = lm.solve(problem, {"x": true + 0.02}, config)
     assert set(early.reason.tolist()) == {lm.CONVERGED_MOVE}
     assert early.iterations < exact.iterations
@@ -85,6 +85,13 @@ def test_a_step_that_is_lost_in_how_little_is_known_is_the_last():
     sigma = inverse.of(LinearFunctions.of_tangents((("x", every),), true, 2)).diagonal(0, 1, 2)
     left = (early.values["x"] - exact.values["x"]) / sigma.sqrt()
     assert float(left.square().mean().sqrt()) < 0.1
+
+
+def test_a_step_that_damping_made_short_is_not_the_last():
+    problem, true = curves(20)
+    config = lm.LmConfig(cost_tolerance=0.0, move_tolerance=0.1, initial_damping=1e6)
+    state = lm.step(problem, lm.init(problem, {"x": true + 0.02}, config), config)
+    assert bool(state.accepted.all()) and set(state.reason.tolist()) == {lm.RUNNING}
 
 
 def test_a_rejected_step_keeps_the_linearisation():
