@@ -39,7 +39,7 @@ from crowdmap_torch.optim.problem import (
     pull_positive,
 )
 from crowdmap_torch.optim.robust import JointTukey, Tukey
-from crowdmap_torch.optim.solvers.bordered import BorderedBackend
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
 from crowdmap_torch.optim.solvers.normal_equations import MapBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
@@ -168,7 +168,7 @@ class Bundle(nn.Module):
         self._by_mount = self.fleet.by_mount(values["pose"])
         self._detections = KeptDetections()
         self._plan = self._elimination()
-        self._backend: BorderedBackend | None = None
+        self._backend: ChainBackend | None = None
 
     @torch.no_grad()
     def _elimination(self) -> EliminationPlan:
@@ -232,9 +232,9 @@ class Bundle(nn.Module):
             getattr(self, f"base_{name}").copy_(values[name])
             getattr(self, f"delta_{name}").zero_()
 
-    def backend(self) -> BorderedBackend:
+    def backend(self) -> ChainBackend:
         """The solver's back end, with the order of elimination and the memory that the last problem took."""
-        self._backend = self._backend or BorderedBackend(self._plan)
+        self._backend = self._backend or ChainBackend(self._plan)
         return self._backend
 
     @torch.no_grad()

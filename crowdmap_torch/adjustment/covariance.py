@@ -24,7 +24,8 @@ from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, MapCo
 from crowdmap_torch.tables import Lanes, Signs
 
 _MOST_PLACES = 500
-"""Places along the lanes of a map without signs at which it is asked what all have in common."""
+"""Signs, or places along the lanes of a map without any, of which it is asked what all have in common: their covariance is
+dense."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,10 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
 
 
 def _shared(covariance: MapCovariance, values: Values, like: Tensor) -> Float[Tensor, "3 3"]:
-    """What the positions of all signs have in common; of a map without signs, those along its lanes."""
+    """What the positions of signs have in common; of a map without signs, those along its lanes."""
     for name, dim in (("sign", 6), ("lane", 3)):
         every = torch.arange(len(values[name]), device=like.device)
-        if name == "lane":
-            every = every[:: max(len(every) // _MOST_PLACES, 1)]
+        every = every[:: max(len(every) // _MOST_PLACES, 1)]
         if len(every):
             position = torch.eye(3, dim).to(like).expand(len(every), 3, dim)
             return covariance.common(LinearFunctions(((name, every),), (position,)))

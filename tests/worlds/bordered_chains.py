@@ -22,8 +22,11 @@ def sighting(pose, mark, measured):
     return offset + 0.01 * offset.square() - measured
 
 
-def drives(lengths=(30, 1, 17), marks=7, seed=0):
-    """Poses on drifting chains, each chain with a bias of its own; the last bias has no chain."""
+def drives(lengths=(30, 1, 17), marks=7, seed=0, *, apart=0.0):
+    """Poses on drifting chains, each chain with a bias of its own; the last bias has no chain.
+
+    Each drive begins so far behind the one before, and marks are spread over all of the way.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def noise(*shape):
@@ -32,9 +35,10 @@ def drives(lengths=(30, 1, 17), marks=7, seed=0):
     chain = torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths))
     n, biases = len(chain), len(lengths) + 1
     way = torch.cat([torch.linspace(0, 10, length) for length in lengths]).double()
+    way = way + apart * chain
     # Two poses hang on every block of the chain.
     carrier = torch.arange(n).repeat_interleave(2)
-    place = torch.linspace(0, 10, marks).double()
+    place = torch.linspace(0, 10 + apart * (len(lengths) - 1), marks).double()
     pose, mark = torch.nonzero((way[carrier][:, None] - place).abs() < 4, as_tuple=True)
     follows = torch.nonzero(chain[1:] == chain[:-1])[:, 0]
     first = torch.cat((chain[:1] >= 0, chain[1:] != chain[:-1])).nonzero()[:, 0]

@@ -9,19 +9,23 @@ of them are
 
     S = C - B A^-1 B^T        S y = -(b - B A^-1 a)        x = -A^-1 (a + B^T y)
 
-the Schur complement on the landmarks, the reduced system and the back-substitution; of C and S the tiles count that hold
-anything (`sparse_tiles`). `elimination` says in which order,
-`chain_sums` adds the blocks up, `block_elimination` is the arithmetic of a round.
+the Schur complement on what stays, the reduced system and the back-substitution; of C and S the tiles count that hold
+anything (`sparse_tiles`). `elimination` says in which order, `chain_sums` adds the blocks up, `block_elimination` is the
+arithmetic of a round.
+
+A journey's constant error touches all its frames, the calibration of a car those of all its journeys. Among the landmarks
+such a border would widen every window, and as a block of the chain it would be a neighbour of all. Its columns are the last
+of C, and what it has in common with the chains is no part of B but F, `border_link`: `border` adds it to S.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
@@ -34,6 +38,7 @@ from crowdmap_torch.optim.solvers.block_elimination import (
     fill_chain,
     lead_of,
 )
+from crowdmap_torch.optim.solvers.border import ChainBorder
 from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
 from crowdmap_torch.optim.solvers.known_landmarks import KnownLandmarks
@@ -81,15 +86,6 @@ class ChainBackend:
 
         The workspace of the solve is the back end's: of its normal equations only the last may be solved.
         """
-        if self.plan.border:
-            names = ", ".join(self.plan.border)
-            raise ValueError(f"the border, {names}, is for BorderedBackend to eliminate")
-        return self.assemble_with_border(problem, values)[0]
-
-    def assemble_with_border(
-        self, problem: Problem, values: Values
-    ) -> tuple[ChainNormalEquations, ReducibleSums]:
-        """The same, and the sums that they were made of, the border's blocks among them."""
         structure, workspace = self.prepare(problem, values)
         coupling = {
             name: workspace.coupling(
@@ -103,7 +99,7 @@ class ChainBackend:
             problem, values, row_blocks, sums.add, groups=groups, chunk_rows=self.chunk_rows
         )
         sums.add_lots()
-        return _equations(costs, sums, workspace), sums
+        return _equations(costs, sums, workspace)
 
     def prepare(self, problem: Problem, values: Values) -> tuple[ChainStructure, Workspace]:
         """The structure of such a problem and the memory for it, unless both are there already."""
@@ -179,57 +175,52 @@ class ChainNormalEquations:
     eliminated_gradient: Float[Tensor, "e k"]
     coupling: Mapping[str, Float[Tensor, "f w _"]]
     """Blocks of B by term, as wide as the eliminated variable."""
+    border_link: Float[Tensor, "e k b"]
+    """Blocks of F: each eliminated block with its chain's blocks of the border's variables, one behind the other."""
     hessian: TileMatrix
     gradient: Float[Tensor, " r"]
     workspace: Workspace = field(repr=False)
 
     def solve(self, damping: Float[Tensor, " 1"]) -> Step:
         """The damped step: eliminate round by round, solve what is left, substitute back."""
-        added_x, added_y = self.damped_by(damping)
+        of_A, of_C = self.diagonal.diagonal(dim1=-2, dim2=-1), self.hessian.diagonal()
+        added_x = damping * of_A.clamp_min(DIAGONAL_FLOOR)
+        added_y = damping * of_C.clamp_min(DIAGONAL_FLOOR)
         right_side = self.factorise(added_x, added_y)
         if right_side is None:
             return failed_step(self.unpack(self.eliminated_gradient, self.gradient), self.cost)
         y = -self.solve_reduced(right_side[:, None])[:, 0]
-        x = self.substitute(y, self.eliminated_gradient)
-        parts = self.step_parts(x, y, added_x, added_y)
-        last, count = (StepPart.alone(y, right_side),), self.structure.where.used.sum(1).to(y)
-        return solved_step(self.unpack(x, y), *parts, last=last, count=count)
-
-    def damped_by(
-        self, damping: Float[Tensor, " 1"]
-    ) -> tuple[Float[Tensor, "e k"], Float[Tensor, " r"]]:
-        """What damping adds to the diagonals of A and C."""
-        of_A = self.diagonal.diagonal(dim1=-2, dim2=-1)
-        of_C = self.hessian.diagonal()
-        return damping * of_A.clamp_min(DIAGONAL_FLOOR), damping * of_C.clamp_min(DIAGONAL_FLOOR)
-
-    def step_parts(
-        self,
-        x: Float[Tensor, "e k"],
-        y: Float[Tensor, " r"],
-        added_x: Float[Tensor, "e k"],
-        added_y: Float[Tensor, " r"],
-    ) -> tuple[StepPart, StepPart]:
-        """The parts of a step of the eliminated blocks and of the landmarks."""
-        return (
+        x = self.substitute(y)
+        parts = (
             StepPart(x[None], self.eliminated_gradient[None], added_x[None]),
             StepPart(y[None], self.gradient[None], added_y[None]),
         )
+        last, count = (StepPart.alone(y, right_side),), self.structure.where.used.sum(1).to(y)
+        return solved_step(self.unpack(x, y), *parts, last=last, count=count)
 
     def unpack(self, x: Float[Tensor, "e k ..."], y: Float[Tensor, "r ..."]) -> dict[str, Tensor]:
         """Tangents by variable."""
         return {**self.structure.where.unpack(y[None]), **self.structure.unstack(x)}
 
     def covariance(self, *, floor: float = UNOBSERVED_FLOOR) -> LandmarkCovariance:
-        """The joint covariance of all landmarks, the eliminated blocks marginalised: the inverse of S, undamped."""
-        nothing = torch.zeros_like(self.eliminated_gradient)
-        if self.factorise(nothing, torch.full_like(self.gradient, floor)) is None:
+        """The joint covariance of all that stays, the eliminated blocks marginalised: the inverse of S, undamped.
+
+        The `floor` is added to landmarks alone.
+        """
+        nothing, added = torch.zeros_like(self.eliminated_gradient), torch.zeros_like(self.gradient)
+        added[: self.structure.border_begin] = floor
+        if self.factorise(nothing, added) is None:
             raise ValueError("the chains' blocks are not positive definite without damping")
         workspace, factor = self.workspace, self.workspace.factor
         assert factor is not None
         return LandmarkCovariance(
-            factor.reduced, self.structure.where, lambda: workspace.factor is factor
+            *(self.structure.where, factor.reduced, self.chains(factor.leads)),
+            lambda: workspace.factor is factor,
         )
+
+    def chains(self, leads: Sequence[Sequence[Lead]]) -> ChainBorder:
+        """The chains, by what the rounds of every part leave behind, and what binds them to what stays."""
+        return ChainBorder(self.structure, self.coupling, self.border_link, leads)
 
     def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, the landmarks known."""
@@ -265,6 +256,7 @@ class ChainNormalEquations:
         products = Products(system)
         leads = tuple(self._eliminate(part, added_x, products) for part in structure.parts)
         products.subtract()
+        self.chains(leads).add(system, self.eliminated_gradient)
         # What is not positive definite on the way gives numbers that are not finite, and the factors none either.
         reduced = TiledCholesky.of(system)
         if reduced is None:
@@ -325,26 +317,6 @@ class ChainNormalEquations:
         assert self.workspace.factor is not None
         return self.structure.solve(self.workspace.factor.leads, right_side)
 
-    def by_part(self) -> list[tuple[Part, tuple[Lead, ...]]]:
-        """The parts, and what their rounds left behind when they were last eliminated."""
-        assert self.workspace.factor is not None
-        return list(zip(self.structure.parts, self.workspace.factor.leads, strict=True))
-
-    def couple(
-        self, part: Part, x: Float[Tensor, "n k c"], column: Int[Tensor, " n"], columns: int
-    ) -> Float[Tensor, "r columns c"]:
-        """B x of a part, the products of its eliminated blocks added up in a column of the result each."""
-        total = x.new_zeros(len(self.gradient) * columns, x.shape[-1])
-        for name, own in part.factors.items():
-            coupling, block = self.structure.couplings.factors[name], self.coupling[name]
-            for at in range(own.start, own.stop, CHUNK_ROWS):
-                here = slice(at, min(at + CHUNK_ROWS, own.stop))
-                of = self.structure.number[coupling.block[here]]
-                entry = coupling.column[here] * columns + column[of][:, None]
-                product = block[here] @ x[of, : block.shape[2]]
-                total.index_add_(0, entry.flatten(), product.flatten(0, 1))
-        return total.view(-1, columns, x.shape[-1])
-
     def couple_back(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
         """B^T y."""
         total = torch.zeros_like(self.eliminated_gradient)
@@ -354,14 +326,15 @@ class ChainNormalEquations:
             total[:, : product.shape[1]].index_add_(0, coupling.block, product)
         return total
 
-    def substitute(
-        self, y: Float[Tensor, " r"], gradient: Float[Tensor, "e k"]
-    ) -> Float[Tensor, "e k"]:
-        """The steps of the eliminated blocks where landmarks make the step y, by the last factors."""
-        return -self.solve_eliminated((gradient + self.couple_back(y))[..., None])[..., 0]
+    def substitute(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
+        """The steps of the eliminated blocks where what stays makes the step y, by the last factors."""
+        of_border = y[self.structure.border][self.structure.owner]
+        linked = self.eliminated_gradient + (self.border_link @ of_border[..., None])[..., 0]
+        return -self.solve_eliminated((linked + self.couple_back(y))[..., None])[..., 0]
 
 
 def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> ChainNormalEquations:
+    none = [sums.link[:, :, :0]]
     return ChainNormalEquations(
         cost=costs.total,
         term_cost=costs.by_term,
@@ -370,29 +343,8 @@ def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> Chain
         link=sums.link,
         eliminated_gradient=sums.gradient(),
         coupling=sums.coupling,
-        hessian=sums.landmark_hessian(),
-        gradient=sums.landmark_gradient(),
+        border_link=torch.cat(none + list(sums.border.values()), dim=-1),
+        hessian=sums.hessian_of_stays(),
+        gradient=sums.gradient_of_stays(),
         workspace=workspace,
-    )
-
-
-def chain_equations(
-    structure: ChainStructure,
-    diagonal: Float[Tensor, "e k k"],
-    link: Float[Tensor, "e k k"],
-    gradient: Float[Tensor, "e k"],
-) -> ChainNormalEquations:
-    """Normal equations of chains and leaves alone, from their blocks; `structure` knows of no landmarks."""
-    nothing = gradient.new_zeros(0)
-    return ChainNormalEquations(
-        cost=gradient.new_zeros(1),
-        term_cost={},
-        structure=structure,
-        diagonal=diagonal,
-        link=link,
-        eliminated_gradient=gradient,
-        coupling={},
-        hessian=TileMatrix.zeros(structure.direct, nothing),
-        gradient=nothing,
-        workspace=Workspace.of(structure, gradient, gradient.shape[1]),
     )

@@ -1,18 +1,17 @@
-"""Where the blocks of rows go in the normal equations of chains: the sums A, B, C of `elimination`, and the border's."""
+"""Where the blocks of rows go in the normal equations of chains: the sums A, B, C and F of `chain_schur`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
-from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, add_blocks, pairs
+from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, pairs
 from crowdmap_torch.optim.solvers.couplings import TermFactors
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, padded
-from crowdmap_torch.optim.solvers.layout import Layout
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 
 
@@ -85,7 +84,7 @@ class ChainSums:
 
 
 class ReducibleSums(ChainSums):
-    """The same with the landmarks' matrix C and, term by term, their coupling B."""
+    """The same with the matrix C of landmarks and border and, term by term, the landmarks' coupling B."""
 
     def __init__(
         self,
@@ -96,12 +95,8 @@ class ReducibleSums(ChainSums):
     ) -> None:
         """`coupling` is memory for B, by term, as wide as its eliminated block; what is in it is of no account."""
         super().__init__(structure, problem, values)
-        dim, like = structure.where.dim, values[structure.plan.chains]
         self.coupling = coupling
-        self._matrix = TileMatrix.zeros(structure.direct, like)
-        self.beside = like.new_zeros(dim, structure.border.dim)
-        """Blocks between landmarks and the border."""
-        self._among = like.new_zeros(structure.border.dim, structure.border.dim)
+        self._matrix = TileMatrix.zeros(structure.direct, values[structure.plan.chains])
         self._lots: dict[tuple[str, int, int], Tensor] = {}
         """By term and two of its slots that stay, their blocks by lot."""
         for blocks in coupling.values():
@@ -128,7 +123,8 @@ class ReducibleSums(ChainSums):
             into = self._lots[key].flatten(0, 1)
             into.index_add_(1, term.lot[chunk.at], square.flatten(0, 1))
         if term is not None:
-            _add_coupling(self.coupling[term.coupling], term, chunk, self.structure.where)
+            into = self.coupling[term.coupling]
+            _add_coupling(into, term, chunk, self.structure.landmarks.first)
 
     def _add_between(
         self,
@@ -137,21 +133,10 @@ class ReducibleSums(ChainSums):
         square: Float[Tensor, "k l m"],
     ) -> None:
         """Adds the blocks between two variables that stay."""
-        where, border = self.structure.where, self.structure.border
-        if one[0] in border.offset and other[0] in where.offset:
-            one, other, square = other, one, square.transpose(0, 1)
-        (name, block), (name_of_other, block_of_other) = one, other
-        row = (where if name in where.offset else border).offset[name][block]
-        right = where if name_of_other in where.offset else border
-        column = right.offset[name_of_other][block_of_other]
-        if right is where:
-            self._matrix.add(row, column, square)
-            self._matrix.add(column, row, square.transpose(0, 1))
-            return
-        into = self.beside if name in where.offset else self._among
-        add_blocks(into.view(-1), row, column, border.dim, square)
-        if into is self._among:
-            add_blocks(into.view(-1), column, row, border.dim, square.transpose(0, 1))
+        where, (name, block), (name_of_other, block_of_other) = self.structure.where, one, other
+        row, column = where.offset[name][block], where.offset[name_of_other][block_of_other]
+        self._matrix.add(row, column, square)
+        self._matrix.add(column, row, square.transpose(0, 1))
 
     def add_lots(self) -> None:
         """Adds what was summed by lot, once all rows are there."""
@@ -160,7 +145,7 @@ class ReducibleSums(ChainSums):
             self._add_between(slots[i], slots[j], square)
         self._lots = {}
 
-    def landmark_hessian(self) -> TileMatrix:
+    def hessian_of_stays(self) -> TileMatrix:
         """The matrix C."""
         where = self.structure.where
         for name, offset in where.offset.items():
@@ -171,32 +156,19 @@ class ReducibleSums(ChainSums):
         self._matrix.add(gap, gap, self._matrix.flat.new_ones(1, 1, len(gap)))
         return self._matrix
 
-    def border_hessian(self) -> Float[Tensor, "z z"]:
-        """The matrix of the border, its variables behind each other."""
-        border = self.structure.border
-        for name, offset in border.offset.items():
-            square = self.by_variable.hessian(name).permute(1, 2, 0)
-            add_blocks(self._among.view(-1), offset, offset, border.dim, square)
-        return self._among
-
-    def border_gradient(self) -> Float[Tensor, " z"]:
-        """The gradient by the border."""
-        border = self.structure.border
-        return border.pack({n: self.by_variable.gradient(n) for n in border.offset})[0]
-
-    def landmark_gradient(self) -> Float[Tensor, " r"]:
+    def gradient_of_stays(self) -> Float[Tensor, " r"]:
         """The gradient b."""
         names = (*self.structure.plan.first_block, *self.structure.where.offset)
         return self.structure.where.pack({n: self.by_variable.gradient(n) for n in names})[0]
 
 
 def _add_coupling(
-    total: Float[Tensor, "f w _"], term: TermFactors, chunk: TermRows, where: Layout
+    total: Float[Tensor, "f w _"], term: TermFactors, chunk: TermRows, landmarks: Collection[str]
 ) -> None:
     """Adds the blocks between the rows' eliminated slot and those of landmarks, in place."""
     slot, start = term.slot, 0
     for other, (name, _) in enumerate(chunk.slots):
-        if name not in where.offset:
+        if name not in landmarks:
             continue
         block = chunk.blocks.hessian[min(slot, other), max(slot, other)]
         block = block.permute(2, 1, 0) if slot < other else block.permute(2, 0, 1)

@@ -15,7 +15,7 @@ that is kept, `windows` says.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -32,8 +32,9 @@ from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern, tile_width
 from crowdmap_torch.optim.solvers.tile_patterns import (
     binds,
+    border_beside,
     direct_pattern,
-    landmark_pairs,
+    pairs_that_stay,
     reduced_pattern,
     tiles_of_factor,
 )
@@ -52,7 +53,7 @@ class ChainStructure:
     width: Mapping[str, int]
     """Tangents of a leaf and of a chain's block, by variable; leaves may be narrower, and are padded to the chains'."""
     where: Layout
-    """The reduced system: all variables but those that the plan names."""
+    """The reduced system: all variables but those that the plan eliminates, those of the border last."""
     couplings: Couplings
     parts: tuple[Part, ...]
     """Chains that are eliminated together, part after part."""
@@ -66,16 +67,25 @@ class ChainStructure:
     """The numbers of C's tiles among those of S."""
     owner: Int[Tensor, " e"]
     """Chain that each block belongs to, counted over leaves and chains."""
-    border: Layout
-    """The border's variables, one behind the other."""
+    border: Int[Tensor, "chains b"]
+    """Columns of what each chain has of the border's variables, one behind the other."""
     keys: Int[Tensor, " keys"] = field(repr=False)
     """What the order has room for: keys `block * count + landmark`, sorted."""
     landmarks: LandmarkBlocks = field(repr=False)
+    stays: LandmarkBlocks = field(repr=False)
+    """The landmarks, and behind them the blocks of the border."""
+    seen_with: frozenset[str]
+    """Variables of the border that rows of an eliminated block and landmarks touch as well."""
 
     @property
     def store_rows(self) -> int:
         """Rows of the store: of the part that needs most."""
         return max((part.store_rows for part in self.parts), default=0)
+
+    @property
+    def border_begin(self) -> int:
+        """First column of the border."""
+        return min([self.where.dim, *self.stays.column[len(self.landmarks.column) :].tolist()])
 
     def with_couplings(self, couplings: Couplings) -> ChainStructure:
         """The same order for other rows, for whose couplings it has room."""
@@ -140,32 +150,29 @@ def analyse(
     Every row may touch one eliminated block and any landmarks; or one or two eliminated blocks, neighbours of a chain or a
     leaf and the block that carries it. Beside them it may touch the chain's blocks of the border.
     """
-    where, landmarks, couplings, keys = _touched(problem, values, plan)
+    stays, landmarks, couplings, keys = _touched(problem, values, plan)
     if plan.room is not None:
         fits = bool(torch.isin(keys, plan.room, assume_unique=True).all())
         keys = plan.room if fits else torch.unique(torch.cat((plan.room, keys)))
-    if before is not None and torch.equal(keys, before.keys):
-        pairs = landmark_pairs(problem, before.landmarks, plan.first_block)
-        if binds(before.direct, before.landmarks, pairs):
+    pairs, seen_with = pairs_that_stay(problem, stays, plan.first_block), _seen_with(problem, plan)
+    if before is not None and torch.equal(keys, before.keys) and seen_with == before.seen_with:
+        if binds(before.direct, before.stays, pairs):
             return before.with_couplings(couplings)
-    pairs = landmark_pairs(problem, landmarks, plan.first_block)
-    rank, section = plan.rank, plan.section
-    if rank is None:
-        rank, section = _rank(keys, pairs, plan.owner, landmarks)
-    order = torch.argsort(rank[: len(landmarks.column)], stable=True)
-    grid = tile_width(where.dim, order.device)
-    where = where.in_order(order, None if section is None else section[order], grid)
-    landmarks = LandmarkBlocks.of(where, plan.chain.device)
-    owner = plan.owner
+    where = _in_order(_stays(problem, values, plan), plan, keys, pairs, landmarks)
+    landmarks, stays = _blocks(where, plan)
     k = problem.variables[plan.chains].tangent_dim
     if plan.leaves is not None and problem.variables[plan.leaves].tangent_dim > k:
         raise ValueError(f"{plan.leaves!r}: expected leaves of at most {k} tangents, the chains'")
+    owner = plan.owner
     size = group_size or min(64, max(4, _beside_each_other(keys, owner, landmarks.count)))
     builders, number = _builders(plan, keys, landmarks, size, k, batch_bytes)
-    direct = direct_pattern(landmarks, keys, pairs)
-    reduced = reduced_pattern(direct, landmarks, *_bound(builders, owner.device))
+    beside = border_beside(keys, landmarks.count, owner, plan.border)
+    by_rows = [of for of in beside if of.variable in seen_with]
+    direct = direct_pattern(stays, landmarks, keys, pairs, by_rows)
+    reduced = reduced_pattern(direct, stays, *_bound(builders, owner.device), beside)
     couplings = couplings.placed(landmarks)
     parts = [builder.part(reduced) for builder in builders]
+    none = [plan.chain.new_zeros(plan.chain_count, 0)]
     return ChainStructure(
         plan=plan,
         width={name: problem.variables[name].tangent_dim for name in plan.first_block},
@@ -177,10 +184,45 @@ def analyse(
         reduced=reduced,
         direct_tiles=reduced.numbers_of(direct),
         owner=owner,
-        border=layout(problem, values, skip=_all_but(problem, plan.border)),
+        border=torch.cat(none + [where.entries(*of) for of in plan.border.items()], dim=1),
         keys=keys,
         landmarks=landmarks,
+        stays=stays,
+        seen_with=seen_with,
     )
+
+
+def _in_order(
+    where: Layout,
+    plan: EliminationPlan,
+    keys: Int[Tensor, " keys"],
+    pairs: Int[Tensor, "n 2"],
+    landmarks: LandmarkBlocks,
+) -> Layout:
+    """The reduced system with the landmarks in the order of the plan, or one that is found, and the border behind them."""
+    rank, section = plan.rank, plan.section
+    if rank is None:
+        rank, section = _rank(keys, pairs, plan.owner, landmarks)
+    count = len(landmarks.column)
+    order = torch.argsort(rank[:count], stable=True)
+    grid = tile_width(where.dim, order.device)
+    last = torch.arange(count, sum(map(len, where.offset.values())), device=order.device)
+    if grid == where.dim:
+        return where.in_order(torch.cat((order, last)))
+    # The border is a section of its own.
+    section = torch.zeros_like(order) if section is None else section[order]
+    section = torch.cat((section, torch.full_like(last, 1 + max(section.tolist(), default=0))))
+    return where.in_order(torch.cat((order, last)), section, grid)
+
+
+def _seen_with(problem: Problem, plan: EliminationPlan) -> frozenset[str]:
+    """Variables of the border that rows touch together with an eliminated block and a landmark."""
+    found = set()
+    for term in problem.terms.values():
+        names = {name for name, _ in term.slots}
+        if names & set(plan.first_block) and names - set(plan.first_block) - set(plan.border):
+            found |= names & set(plan.border)
+    return frozenset(found)
 
 
 def _builders(
@@ -265,8 +307,8 @@ def planned_ahead(
     worked out on the CPU), and there is room for rows that go over to the next landmark, by number, of the `sliding`
     variables: along a row of landmarks, of which each block's number is given, and not from one row to another.
     """
-    _, landmarks, _, keys = _touched(problem, values, plan)
-    pairs = landmark_pairs(problem, landmarks, plan.first_block)
+    stays, landmarks, _, keys = _touched(problem, values, plan)
+    pairs = pairs_that_stay(problem, stays, plan.first_block)
     room, count = [keys], landmarks.count
     for name, of in (sliding or {}).items():
         at = keys % count - landmarks.first[name]
@@ -285,16 +327,22 @@ def planned_ahead(
 
 def _touched(
     problem: Problem, values: Values, plan: EliminationPlan
-) -> tuple[Layout, LandmarkBlocks, Couplings, Int[Tensor, " keys"]]:
-    """The reduced system, its blocks, and what of it the eliminated blocks are coupled to, by term and as keys."""
-    where = layout(problem, values, skip=(*plan.first_block, *plan.border))
-    landmarks = LandmarkBlocks.of(where, plan.chain.device)
+) -> tuple[LandmarkBlocks, LandmarkBlocks, Couplings, Int[Tensor, " keys"]]:
+    """What stays, the landmarks of it, and which of these the eliminated blocks are coupled to, by term and as keys."""
+    landmarks, stays = _blocks(_stays(problem, values, plan), plan)
     couplings = couplings_of(problem.terms, plan, landmarks)
-    return where, landmarks, couplings, couplings.touched(landmarks)
+    return stays, landmarks, couplings, couplings.touched(landmarks)
 
 
-def _all_but(problem: Problem, names: Collection[str]) -> tuple[str, ...]:
-    return tuple(name for name in problem.variables if name not in names)
+def _stays(problem: Problem, values: Values, plan: EliminationPlan) -> Layout:
+    """The reduced system in no particular order, but for the border, which is last."""
+    return layout(problem, values, skip=plan.first_block, last=plan.border)
+
+
+def _blocks(where: Layout, plan: EliminationPlan) -> tuple[LandmarkBlocks, LandmarkBlocks]:
+    """The landmarks of a reduced system, and all that stays; the landmarks have the same numbers in both."""
+    device = plan.chain.device
+    return LandmarkBlocks.of(where, device, skip=plan.border), LandmarkBlocks.of(where, device)
 
 
 def _rank(
@@ -308,6 +356,8 @@ def _rank(
     With the section of the line that each is in, where it is worth to begin sections with tiles.
     """
     count = landmarks.count
+    # What is bound to the border alone is nowhere near anything.
+    pairs = pairs[(pairs < len(landmarks.column)).all(1)]
     block, landmark = keys // count, torch.cat((keys % count, pairs.flatten()))
     # Blocks of a chain are coupled to nearly what their neighbours are: a few of them together tell the same.
     by_few = incidence((block // 8).cpu().numpy(), (keys % count).cpu().numpy(), count)

@@ -1,4 +1,4 @@
-"""The covariance of landmarks: what of it is asked for, out of the factors of their reduced system."""
+"""The covariance of what stays, landmarks and border: what of it is asked for, out of the factors of the reduced system."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.optim.solvers.border import ChainBorder, chain_sums
 from crowdmap_torch.optim.solvers.layout import Layout, read_entries
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
@@ -17,14 +18,21 @@ _COLUMNS = 256
 
 
 class LandmarkCovariance:
-    """The covariance of landmarks as far as they are bound to each other, and of any functions of them."""
+    """The covariance of landmarks and border as far as they are bound to each other, and of any functions of them.
+
+    Of sums over chains too; chains and leaves are marginalised.
+    """
 
     def __init__(
-        self, factor: TiledCholesky, where: Layout, is_current: Callable[[], bool]
+        self,
+        where: Layout,
+        factor: TiledCholesky,
+        chains: ChainBorder,
+        is_current: Callable[[], bool],
     ) -> None:
         """`is_current` says whether the factors are there still: others may come into their memory."""
         self.where = where
-        self._factor, self._is_current = factor, is_current
+        self._factor, self._chains, self._is_current = factor, chains, is_current
         # Of its own: the next factors come where these are.
         self._inverse = factor.selected_inverse()
 
@@ -36,6 +44,35 @@ class LandmarkCovariance:
     def entries(self, at: Int[Tensor, "n q"]) -> Float[Tensor, "n q q"]:
         """The covariance of tangents, row by row."""
         return self._inverse.read(at[:, :, None], at[:, None])
+
+    def of_border(self, *names: str) -> Float[Tensor, "n b b"]:
+        """Joint covariance of the blocks that variables of the border have of each number, one behind the other."""
+        return self.entries(torch.cat([self.where.entries(n, slice(None)) for n in names], dim=1))
+
+    def of_border_mean(self, name: str) -> Float[Tensor, "k k"]:
+        """Covariance of the mean over all blocks of a variable of the border."""
+        entry = self.where.entries(name, slice(None))
+        joint = self._inverse.read(entry[:, None, :, None], entry[None, :, None])
+        return joint.sum((0, 1)) / max(len(entry), 1) ** 2
+
+    def of_sums(
+        self, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
+    ) -> Float[Tensor, "j m m"]:
+        """Covariance of `m` weighted sums over chains' blocks, leaves left out; `of` says of which of them each chain is.
+
+        ValueError where the factors are there no more.
+        """
+        self._check()
+        found, sums = chain_sums(self._chains, weight, of, count)
+        m = weight.shape[-1]
+        each = max(_COLUMNS // m, 1)
+        for begin in range(0, count, each):
+            end = min(begin + each, count)
+            through = self._factor.whitened(
+                sums.functions(begin, end, self.where.dim).flatten(1)
+            ).unflatten(1, (-1, m))
+            found[begin:end] += torch.einsum("rjm,rjn->jmn", through, through)
+        return found
 
     def solve(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
         """The covariance times right-hand sides; ValueError where the factors are there no more."""

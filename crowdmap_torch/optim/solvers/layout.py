@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -86,14 +86,16 @@ def in_sections(
     return begins, used
 
 
-def layout(problem: Problem, values: Values, *, skip: tuple[str, ...] = ()) -> Layout:
-    """Blocks of every variable (but those in `skip`) packed behind each other, group by group."""
+def layout(
+    problem: Problem, values: Values, *, skip: Collection[str] = (), last: Collection[str] = ()
+) -> Layout:
+    """Blocks of every variable (but those in `skip`) packed behind each other, group by group; `last` come last."""
     first = next(iter(values.values()))
     used_dim = torch.zeros(problem.group_count, dtype=torch.long, device=first.device)
     offset, group = {}, {}
-    for name, variable in problem.variables.items():
-        if name in skip:
-            continue
+    every = [name for name in problem.variables if name not in {*skip, *last}]
+    for name in (*every, *last):
+        variable = problem.variables[name]
         n = len(values[name])
         of = variable.group
         of = torch.zeros(n, dtype=torch.long, device=first.device) if of is None else of

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -18,37 +19,84 @@ from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern, tile_width
 from crowdmap_torch.optim.solvers.windows import LandmarkBlocks
 
 
-def landmark_pairs(
-    problem: Problem, landmarks: LandmarkBlocks, eliminated: Collection[str]
+def pairs_that_stay(
+    problem: Problem, stays: LandmarkBlocks, eliminated: Collection[str]
 ) -> Int[Tensor, "n 2"]:
-    """Landmarks that rows bind to each other without an eliminated block."""
-    found = [torch.zeros(0, 2, dtype=torch.long, device=landmarks.column.device)]
+    """Landmarks, and blocks of the border, that rows bind to each other without an eliminated block."""
+    found = [torch.zeros(0, 2, dtype=torch.long, device=stays.column.device)]
     for term in problem.terms.values():
         if any(name in eliminated for name, _ in term.slots):
             continue
-        blocks = [at + landmarks.first[name] for name, at in term.slots if name in landmarks.first]
+        blocks = [at + stays.first[name] for name, at in term.slots if name in stays.first]
         found += [torch.stack(pair, dim=1) for pair in _pairs(blocks)]
     first, second = torch.cat(found).unbind(1)
-    key = torch.unique(first * landmarks.count + second)
-    return torch.stack((key // landmarks.count, key % landmarks.count), dim=1)
+    key = torch.unique(first * stays.count + second)
+    return torch.stack((key // stays.count, key % stays.count), dim=1)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Landmarks, and blocks of a variable of the border that they are bound to: pair by pair."""
+
+    variable: str
+    landmark: Int[Tensor, " n"]
+    block: Int[Tensor, " n"]
+
+
+def border_beside(
+    keys: Int[Tensor, " keys"],
+    count: int,
+    owner: Int[Tensor, " e"],
+    border: Mapping[str, Int[Tensor, " chains"]],
+) -> tuple[Beside, ...]:
+    """Each landmark with what the chains that are coupled to it have of the border, by couplings as keys."""
+    own = torch.unique(owner[keys // count] * count + keys % count)
+    chain, landmark = own // count, own % count
+    return tuple(Beside(name, landmark, block[chain]) for name, block in border.items())
 
 
 def direct_pattern(
-    landmarks: LandmarkBlocks, keys: Int[Tensor, " keys"], pairs: Int[Tensor, "n 2"]
+    stays: LandmarkBlocks,
+    landmarks: LandmarkBlocks,
+    keys: Int[Tensor, " keys"],
+    pairs: Int[Tensor, "n 2"],
+    beside: Sequence[Beside],
 ) -> TilePattern:
-    """That of C: landmarks that one eliminated block is coupled to (`keys`), and those that are bound without any."""
-    device, count = landmarks.column.device, landmarks.count
-    width = tile_width(landmarks.dim, device)
-    present = _bound(keys // count, keys % count, landmarks, width)
+    """That of C: what one eliminated block is coupled to (`keys`), and what is bound without any; the border goes last.
+
+    `beside` landmarks is what rows of eliminated blocks have of the border as well. `stays` are landmarks and border.
+    """
+    device, count = stays.column.device, landmarks.count
+    width = tile_width(stays.dim, device)
+    present = _bound(keys // count, keys % count, stays, width)
     number = torch.arange(len(pairs), device=device)
-    present |= _bound(number.repeat_interleave(2), pairs.flatten(), landmarks, width)
-    return TilePattern.of(landmarks.dim, width, present, device)
+    present |= _bound(number.repeat_interleave(2), pairs.flatten(), stays, width)
+    border = stays.column[len(landmarks.column) :] // width
+    if len(border):
+        present[int(border.min()) :, int(border.min()) :] = True
+    return TilePattern.of(stays.dim, width, present | _between(stays, beside, width), device)
 
 
-def binds(direct: TilePattern, landmarks: LandmarkBlocks, pairs: Int[Tensor, "n 2"]) -> bool:
-    """Whether a pattern of C has room for what binds these landmarks without an eliminated block."""
-    first = landmarks.column[pairs]
-    last = first + landmarks.width[pairs] - 1
+def _between(stays: LandmarkBlocks, beside: Sequence[Beside], width: int) -> NDArray[np.bool_]:
+    """Tiles between landmarks and what is `beside` them of the border."""
+    tiles = -(-stays.dim // width)
+    present = np.zeros((tiles, tiles), dtype=bool)
+    for of in beside:
+        # A block lies in two tiles at most.
+        ends = [
+            (stays.column[at] // width, (stays.column[at] + stays.width[at] - 1) // width)
+            for at in (of.landmark, of.block + stays.first[of.variable])
+        ]
+        for row, column in product(*ends):
+            pair = torch.unique(row * tiles + column).cpu().numpy()
+            present[pair // tiles, pair % tiles] = True
+    return present
+
+
+def binds(direct: TilePattern, stays: LandmarkBlocks, pairs: Int[Tensor, "n 2"]) -> bool:
+    """Whether a pattern of C has room for what binds these blocks without an eliminated one."""
+    first = stays.column[pairs]
+    last = first + stays.width[pairs] - 1
     corners = [
         direct.present[torch.minimum(a, b), torch.maximum(a, b)]
         for a in (first[:, 0] // direct.width, last[:, 0] // direct.width)
@@ -59,13 +107,17 @@ def binds(direct: TilePattern, landmarks: LandmarkBlocks, pairs: Int[Tensor, "n 
 
 def reduced_pattern(
     direct: TilePattern,
-    landmarks: LandmarkBlocks,
+    stays: LandmarkBlocks,
     group: Int[Tensor, " n"],
     place: Int[Tensor, " n"],
+    beside: Sequence[Beside],
 ) -> TilePattern:
-    """That of S and of its factor: windows of groups bind the landmarks at their places, in the order of columns."""
-    present = _bound(group, landmarks.ordered[place], landmarks, direct.width)
-    present |= direct.present.cpu().numpy()
+    """That of S and of its factor: windows of groups bind the landmarks at their places, in the order of columns.
+
+    Chains bind the landmarks that they are coupled to with what they have `beside` them of the border.
+    """
+    present = _bound(group, stays.ordered[place], stays, direct.width)
+    present |= direct.present.cpu().numpy() | _between(stays, beside, direct.width)
     return TilePattern.of(direct.dim, direct.width, present, direct.own.device).filled()
 
 

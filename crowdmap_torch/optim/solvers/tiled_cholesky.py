@@ -63,19 +63,37 @@ class TiledCholesky:
 
     def solve(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
         """The inverse times right-hand sides."""
-        pattern, tiles = self.upper.pattern, self.upper.tiles
-        number, w = pattern.number, pattern.width
-        x = right_side.new_zeros(pattern.tiles, w, right_side.shape[1])
-        x.view(-1, right_side.shape[1])[: pattern.dim] = right_side
+        pattern, tiles, number = self.upper.pattern, self.upper.tiles, self.upper.pattern.number
+        x = self._begun(right_side)
         for k, right in enumerate(pattern.columns):
-            x[k] = torch.linalg.solve_triangular(tiles[number[k][k]].mT, x[k], upper=False)
-            for j in right:
-                x[j].addmm_(tiles[number[k][j]].mT, x[k], alpha=-1)
+            self._forward(x, k, right)
         for k, right in reversed(list(enumerate(pattern.columns))):
             for j in right:
                 x[k].addmm_(tiles[number[k][j]], x[j], alpha=-1)
             x[k] = torch.linalg.solve_triangular(tiles[number[k][k]], x[k], upper=True)
         return x.view(-1, right_side.shape[1])[: pattern.dim].contiguous()
+
+    def whitened(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "p c"]:
+        """U^-T times right-hand sides, of which products are those with the inverse; where they are zero costs nothing."""
+        x = self._begun(right_side)
+        for k, right in enumerate(self.upper.pattern.columns):
+            if bool(x[k].any()):
+                self._forward(x, k, right)
+        return x.flatten(0, 1)
+
+    def _begun(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "t w c"]:
+        """Right-hand sides by rows of tiles."""
+        pattern = self.upper.pattern
+        x = right_side.new_zeros(pattern.tiles, pattern.width, right_side.shape[1])
+        x.view(-1, right_side.shape[1])[: pattern.dim] = right_side
+        return x
+
+    def _forward(self, x: Float[Tensor, "t w c"], k: int, right: tuple[int, ...]) -> None:
+        """Solves for a row of tiles, and takes it off those below; in place."""
+        tiles, number = self.upper.tiles, self.upper.pattern.number
+        x[k] = torch.linalg.solve_triangular(tiles[number[k][k]].mT, x[k], upper=False)
+        for j in right:
+            x[j].addmm_(tiles[number[k][j]].mT, x[k], alpha=-1)
 
     def selected_inverse(self) -> TileMatrix:
         """The inverse where the factor has tiles."""

@@ -11,7 +11,7 @@ subtracts its products from the tiles in place, run by run, above the diagonal a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -91,6 +91,7 @@ class LandmarkBlocks:
     width_of: dict[str, int]
     """Of the blocks of each variable."""
     dim: int
+    """Columns of the whole system."""
     ordered: Int[Tensor, " q"]
     """The blocks in the order of their columns."""
     position: Int[Tensor, " q"]
@@ -99,10 +100,12 @@ class LandmarkBlocks:
     """The block of every column; that before it of a column that is nobody's."""
 
     @classmethod
-    def of(cls, where: Layout, device: torch.device) -> LandmarkBlocks:
-        """Those of a reduced system."""
+    def of(cls, where: Layout, device: torch.device, skip: Collection[str] = ()) -> LandmarkBlocks:
+        """Those of a reduced system, the variables `skip`, whose columns are the last, left out."""
         first, columns, widths, total = {}, [], [], 0
         for name, offset in where.offset.items():
+            if name in skip:
+                continue
             first[name] = total
             total += len(offset)
             columns.append(offset)
@@ -288,7 +291,7 @@ class WindowBuilder:
         dim = self.landmarks.dim
         known = columns < dim
         lm = rest = torch.zeros_like(columns)[:, None, :, None]
-        if dim:
+        if len(self.landmarks.column):
             at = torch.where(known, columns, 0)
             lm = self.landmarks.of_column[at]
             lm, rest = lm[:, None, :, None], (at - self.landmarks.column[lm])[:, None, :, None]

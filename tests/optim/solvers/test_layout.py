@@ -8,7 +8,7 @@ import torch
 from worlds.bordered_chains import drives
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
-from crowdmap_torch.optim.solvers.bordered import BorderedBackend
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.layout import SparsityPattern, layout
 
@@ -47,7 +47,7 @@ def test_a_pattern_is_of_values_and_not_of_tensors():
 
 def test_rows_changed_in_place_give_the_step_of_the_changed_problem():
     problem, values, plan = drives()
-    backend, damping = BorderedBackend(plan), torch.tensor([1e-3], dtype=torch.float64)
+    backend, damping = ChainBackend(plan), torch.tensor([1e-3], dtype=torch.float64)
     backend.assemble(problem, values).solve(damping)
     mark = problem.terms["sighting"].slots[1][1]
     mark.copy_((mark + 1) % len(values["mark"]))
@@ -58,9 +58,9 @@ def test_rows_changed_in_place_give_the_step_of_the_changed_problem():
 
 def test_a_problem_rebuilt_keeps_the_structure(monkeypatch):
     problem, values, plan = drives()
-    backend = BorderedBackend(plan)
-    first = backend.assemble(problem, values).inner.structure
-    assert backend.assemble(rebuilt(problem), values).inner.structure is first
+    backend = ChainBackend(plan)
+    first = backend.assemble(problem, values).structure
+    assert backend.assemble(rebuilt(problem), values).structure is first
     longer = CostTerm(lambda m: m, (("mark", torch.arange(len(values["mark"]))),))
     more = replace(problem, terms={**problem.terms, "prior": longer})
-    assert backend.assemble(more, values).inner.structure is not first
+    assert backend.assemble(more, values).structure is not first

@@ -10,7 +10,7 @@ from torch import Tensor
 from worlds.bordered_chains import drives, rows_of, shared_drives
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values
-from crowdmap_torch.optim.solvers.bordered import BorderedBackend
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import (
     Backend,
@@ -20,7 +20,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 )
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 
-BACKENDS = {"dense": lambda plan: DenseBackend(), "bordered": BorderedBackend}
+BACKENDS = {"dense": lambda plan: DenseBackend(), "bordered": ChainBackend}
 DAMPING = torch.tensor([1e-2], dtype=torch.float64)
 
 
@@ -58,7 +58,7 @@ def test_a_border_of_another_chain_is_refused():
     (drift, block), (bias, at) = term.slots
     terms = {**problem.terms, "start": replace(term, slots=((drift, block), (bias, at.flip(0))))}
     with pytest.raises(ValueError, match="'bias' of another chain"):
-        BorderedBackend(plan).assemble(replace(problem, terms=terms), values)
+        ChainBackend(plan).assemble(replace(problem, terms=terms), values)
 
 
 def test_what_another_chain_shares_is_refused():
@@ -67,7 +67,7 @@ def test_what_another_chain_shares_is_refused():
     wrong = replace(problem.terms["bound"], slots=(pose, drift, (car, 1 - at)))
     terms = {**problem.terms, "bound": wrong}
     with pytest.raises(ValueError, match="'car' of another chain"):
-        BorderedBackend(plan).assemble(replace(problem, terms=terms), values)
+        ChainBackend(plan).assemble(replace(problem, terms=terms), values)
 
 
 def functions_of_marks(generator: torch.Generator) -> LinearFunctions:
@@ -109,7 +109,7 @@ def test_what_functions_have_in_common_is_all_that_can_be_taken_off_them(generat
     problem, values, plan = drives(lengths=(5, 1, 4))
     every = torch.arange(len(values["mark"]))
     marks = LinearFunctions.of_tangents((("mark", every),), values["mark"], 2)
-    normal = BorderedBackend(plan).assemble(problem, values)
+    normal = ChainBackend(plan).assemble(problem, values)
     assert isinstance(normal, MapEquations)
     common = normal.covariance().common(marks)
     dense = DenseBackend().assemble(problem, values)

@@ -9,7 +9,7 @@ import torch
 from worlds.bordered_chains import drives, rows_of, shared_drives, wandering_drives
 
 from crowdmap_torch.optim import levenberg_marquardt as lm
-from crowdmap_torch.optim.solvers.bordered import BorderedBackend
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 
@@ -17,7 +17,7 @@ from crowdmap_torch.optim.solvers.dense import DenseBackend
 @pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
 def test_a_border_gives_the_dense_step(lengths, world):
     problem, values, plan = world(lengths)
-    ours, dense = (b.assemble(problem, values) for b in (BorderedBackend(plan), DenseBackend()))
+    ours, dense = (b.assemble(problem, values) for b in (ChainBackend(plan), DenseBackend()))
     torch.testing.assert_close(ours.cost, dense.cost)
     for name, cost in dense.term_cost.items():
         torch.testing.assert_close(ours.term_cost[name], cost)
@@ -30,12 +30,29 @@ def test_a_border_gives_the_dense_step(lengths, world):
         torch.testing.assert_close(mine.norm, theirs.norm)
 
 
+def test_a_place_has_nothing_to_do_with_drives_elsewhere():
+    """120 drives along a road in turn: the step is the dense one, and the border's tiles are those of drives past them."""
+    problem, values, plan = drives((6,) * 120, 500, apart=8.0)
+    backend, dense = ChainBackend(plan), DenseBackend().assemble(problem, values)
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    normal = backend.assemble(problem, values)
+    mine, theirs = normal.solve(damping), dense.solve(damping)
+    for name in values:
+        torch.testing.assert_close(mine.delta[name], theirs.delta[name], rtol=1e-8, atol=1e-10)
+    pattern, begin = normal.structure.direct, normal.structure.border_begin // 96
+    assert pattern.width == 96
+    assert not bool(pattern.present[:begin, begin:].any())
+    between = normal.structure.reduced.present[:begin, begin:]
+    assert between.shape[1] > 2
+    assert float(between.double().mean()) < 0.8
+
+
 @pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
 def test_a_step_tells_by_how_many_sigmas_landmarks_and_border_move(world):
     problem, values, plan = world()
     dense = DenseBackend().assemble(problem, values)
     damping = torch.tensor([1e-12], dtype=torch.float64)
-    step = BorderedBackend(plan).assemble(problem, values).solve(damping)
+    step = ChainBackend(plan).assemble(problem, values).solve(damping)
     gone = torch.cat([rows_of(dense, name) for name in ("pose", "drift")])
     stays = torch.ones(dense.where.dim, dtype=torch.bool)
     stays[gone] = False
@@ -56,7 +73,7 @@ def test_covariances_are_blocks_of_the_dense_inverse(world):
     weight = torch.zeros(len(chain), width, 2, dtype=torch.float64)
     weight[:, 0, 0] = 1 / torch.bincount(chain)[chain].double()
     weight[:, 1, 1] = torch.linspace(-1, 2, len(chain)).double()
-    found = BorderedBackend(plan).assemble(problem, values).covariance(floor=0.0)
+    found = ChainBackend(plan).assemble(problem, values).covariance(floor=0.0)
     mark, drift = rows_of(dense, "mark"), rows_of(dense, "drift")
     at = found.where.entries("mark", slice(None)).flatten()
     of_marks = found.solve(torch.eye(found.where.dim).double())[at][:, at]
@@ -87,7 +104,7 @@ def test_covariances_are_blocks_of_the_dense_inverse(world):
 
 def test_a_covariance_whose_factors_are_gone_is_refused():
     problem, values, plan = drives()
-    normal = BorderedBackend(plan).assemble(problem, values)
+    normal = ChainBackend(plan).assemble(problem, values)
     covariance = normal.covariance()
     normal.solve(torch.tensor([1e-3], dtype=torch.float64))
     with pytest.raises(ValueError, match="solved since"):
@@ -98,7 +115,7 @@ def test_a_covariance_whose_factors_are_gone_is_refused():
 def test_the_minimum_is_that_of_the_dense_back_end(world):
     problem, values, plan = world(seed=1)
     config = lm.LmConfig(cost_tolerance=1e-13)
-    ours = lm.solve(problem, values, config, backend=BorderedBackend(plan))
+    ours = lm.solve(problem, values, config, backend=ChainBackend(plan))
     theirs = lm.solve(problem, values, config)
     assert ours.done
     for name, value in theirs.values.items():
@@ -107,8 +124,8 @@ def test_the_minimum_is_that_of_the_dense_back_end(world):
 
 def test_a_chain_that_is_not_positive_definite_moves_nothing():
     problem, values, plan = drives()
-    normal = BorderedBackend(plan).assemble(problem, values)
-    normal.inner.diagonal[40] = -normal.inner.diagonal[40]
+    normal = ChainBackend(plan).assemble(problem, values)
+    normal.diagonal[40] = -normal.diagonal[40]
     step = normal.solve(torch.tensor([1e-9], dtype=torch.float64))
     assert not bool(step.solved)
     assert not any(delta.any() for delta in step.delta.values())
@@ -120,8 +137,8 @@ def test_terms_that_touch_the_same_blocks_share_their_factors():
     sighting = problem.terms["sighting"]
     again = replace(sighting, constants=(sighting.constants[0] + 0.3,))
     both = replace(problem, terms={**problem.terms, "again": again})
-    normal = BorderedBackend(plan).assemble(both, values)
-    assert list(normal.inner.coupling) == ["sighting"]
+    normal = ChainBackend(plan).assemble(both, values)
+    assert list(normal.coupling) == ["sighting"]
     damping = torch.full((1,), 1e-3, dtype=torch.double)
     found, expected = normal.solve(damping), DenseBackend().assemble(both, values).solve(damping)
     for name, delta in expected.delta.items():
@@ -131,6 +148,6 @@ def test_terms_that_touch_the_same_blocks_share_their_factors():
     slots = tuple((name, block[turned]) for name, block in again.slots)
     again = replace(again, slots=slots, constants=(again.constants[0][turned],))
     other = replace(problem, terms={**problem.terms, "again": again})
-    same = BorderedBackend(plan).assemble(other, values)
-    assert list(same.inner.coupling) == ["sighting"]
-    torch.testing.assert_close(same.inner.coupling["sighting"], normal.inner.coupling["sighting"])
+    same = ChainBackend(plan).assemble(other, values)
+    assert list(same.coupling) == ["sighting"]
+    torch.testing.assert_close(same.coupling["sighting"], normal.coupling["sighting"])

@@ -1,0 +1,187 @@
+"""What drives have to themselves or share, eliminated last: what their chains say of it, in the reduced system.
+
+With F between the chains and the border, the last columns of C and S of `chain_schur` are the border's; its own part and
+that beside the landmarks become
+
+    G - F^T A^-1 F        E - B A^-1 F        g - F^T A^-1 a
+
+where C has G and E. Chains touch each other through what stays alone, so one column of right-hand sides serves all of them.
+The factor's tiles take the border as they take landmarks: one that no drive past a place has to do with has none there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.optim.linearize import CHUNK_ROWS
+from crowdmap_torch.optim.solvers.block_elimination import Lead
+from crowdmap_torch.optim.solvers.elimination import ChainStructure
+from crowdmap_torch.optim.solvers.parts import Part
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.processes.threads import in_order
+
+
+@dataclass(frozen=True)
+class Through:
+    """What right-hand sides of a part's blocks are to what stays, by way of A^-1."""
+
+    x: Float[Tensor, "n k c"]
+    """A^-1 of them."""
+    row: Int[Tensor, " r"]
+    """Columns of the reduced system of the landmarks that the part is coupled to."""
+    by_landmark: Float[Tensor, "r columns c"]
+    """B x, those of one column added up."""
+    chain: Int[Tensor, " h"]
+    """The part's chains."""
+    by_chain: Float[Tensor, "h b c"]
+    """F^T x, chain by chain."""
+    own: Float[Tensor, "h c d"]
+    """x^T times what else is asked for, chain by chain."""
+
+
+@dataclass(frozen=True)
+class ChainBorder:
+    """The chains, once they are eliminated, and what binds them to what stays."""
+
+    structure: ChainStructure
+    coupling: Mapping[str, Float[Tensor, "f w _"]]
+    """Blocks of B."""
+    link: Float[Tensor, "e k b"]
+    """Blocks of F."""
+    leads: Sequence[Sequence[Lead]]
+    """What the rounds of every part leave behind of A."""
+
+    def add(self, system: TileMatrix, gradient: Float[Tensor, "e k"]) -> None:
+        """Adds what chains say of the border to the reduced system and its right-hand side; `gradient` is a.
+
+        Part by part and variable by variable: A^-1 F of all of them is larger than what is solved.
+        """
+        structure, plan, pattern = self.structure, self.structure.plan, system.pattern
+        first, every = 0, []
+        for name in plan.border:
+            columns = slice(first, first + structure.where.tangent_dim[name])
+            first = columns.stop
+            every += [(*of, name, columns) for of in zip(structure.parts, self.leads, strict=True)]
+
+        def of_variable(of: tuple[Part, Sequence[Lead], str, slice]) -> tuple[Through, Tensor]:
+            part, leads, name, columns = of
+            right_side = self.link[part.block][..., columns]
+            block = plan.border[name][structure.owner[part.block]]
+            seen, column = torch.unique(block, return_inverse=True)
+            with_gradient = gradient[part.block][..., None]
+            return self.through(part, leads, right_side, with_gradient, column, len(seen)), seen
+
+        forgotten = pattern.at(*torch.full((2, 1), pattern.dim + 1, device=gradient.device))
+        done = in_order(of_variable, every, gradient.device, worth=1)
+        for (*_, name, columns), (found, seen) in zip(every, done, strict=True):
+            at = pattern.at(found.row[:, None, None], structure.where.entries(name, seen))
+            # Not all that a part is coupled to has to do with all that it has of the border.
+            at = torch.where(at < 0, forgotten, at)
+            system.flat.index_add_(0, at.flatten(), found.by_landmark.flatten(), alpha=-1)
+            entry = structure.border[found.chain]
+            at = pattern.at(entry[:, :, None], entry[:, None, columns])
+            system.flat.index_add_(0, at.flatten(), found.by_chain.flatten(), alpha=-1)
+            at = entry[:, columns].flatten()
+            system.right_side.index_add_(0, at, found.own.flatten(), alpha=-1)
+
+    def through(
+        self,
+        part: Part,
+        leads: Sequence[Lead],
+        right_side: Float[Tensor, "n k c"],
+        beside: Float[Tensor, "n k d"],
+        column: Int[Tensor, " n"],
+        columns: int,
+    ) -> Through:
+        """A^-1 of right-hand sides of a part's blocks, and what it is to what stays.
+
+        `column` is that of each block in the landmarks' sums; the products with what stands `beside` are summed up as well.
+        """
+        structure = self.structure
+        x = part.solve(leads, right_side)
+        chain, of = torch.unique(structure.owner[part.block], return_inverse=True)
+        row, by_landmark = self._couple(part, x, column, columns)
+        by_chain = x.new_zeros(len(chain), self.link.shape[-1], x.shape[-1])
+        by_chain.index_add_(0, of, self.link[part.block].mT @ x)
+        own = x.new_zeros(len(chain), x.shape[-1], beside.shape[-1])
+        own.index_add_(0, of, x.mT @ beside)
+        return Through(x, row, by_landmark, chain, by_chain, own)
+
+    def _couple(
+        self, part: Part, x: Float[Tensor, "n k c"], column: Int[Tensor, " n"], columns: int
+    ) -> tuple[Int[Tensor, " r"], Float[Tensor, "r columns c"]]:
+        """The columns of the reduced system that a part is coupled to, and B x there."""
+        structure = self.structure
+        each = [structure.couplings.factors[name].column[own] for name, own in part.factors.items()]
+        row = torch.unique(torch.cat([column.new_zeros(0), *(at.flatten() for at in each)]))
+        total = x.new_zeros(len(row) * columns, x.shape[-1])
+        for (name, own), at in zip(part.factors.items(), each, strict=True):
+            block, factors = self.coupling[name][own], structure.couplings.factors[name].block[own]
+            for begin in range(0, len(at), CHUNK_ROWS):
+                some = slice(begin, begin + CHUNK_ROWS)
+                of = structure.number[factors[some]]
+                entry = torch.searchsorted(row, at[some]) * columns + column[of][:, None]
+                product = block[some] @ x[of, : block.shape[2]]
+                total.index_add_(0, entry.flatten(), product.flatten(0, 1))
+        return row, total.view(-1, columns, x.shape[-1])
+
+
+@dataclass(frozen=True)
+class ChainSums:
+    """Weighted sums over chains' blocks as functions of what stays, entry by entry."""
+
+    row: Int[Tensor, " n"]
+    """Column of the reduced system."""
+    of: Int[Tensor, " n"]
+    """Which sums."""
+    value: Float[Tensor, "n m"]
+
+    def functions(self, begin: int, end: int, dim: int) -> Float[Tensor, "dim sums m"]:
+        """Those of the sums from `begin` to `end`."""
+        here = torch.nonzero((self.of >= begin) & (self.of < end))[:, 0]
+        total = self.value.new_zeros(dim * (end - begin), self.value.shape[1])
+        at = self.row[here] * (end - begin) + self.of[here] - begin
+        return total.index_add_(0, at, self.value[here]).view(dim, end - begin, -1)
+
+
+def chain_sums(
+    chains: ChainBorder, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
+) -> tuple[Float[Tensor, "j m m"], ChainSums]:
+    """Covariance of weighted sums over chains' blocks, what stays known, and how they go with what stays.
+
+    Leaves are left out; `of` says of which of the sums each chain is.
+    """
+    structure, m = chains.structure, weight.shape[-1]
+    leaves = weight.new_zeros(structure.plan.leaf_count, *weight.shape[1:])
+    full, own = torch.cat((leaves, weight)), weight.new_zeros(count, m, m)
+    every = list(zip(structure.parts, chains.leads, strict=True))
+
+    def of_part(one: tuple[Part, Sequence[Lead]]) -> tuple[Through, Tensor]:
+        part, leads = one
+        seen, column = torch.unique(of[structure.owner[part.block]], return_inverse=True)
+        w = full[part.block]
+        return chains.through(part, leads, w, w, column, len(seen)), seen
+
+    row, of_sum, value = [], [], []
+    for found, seen in in_order(of_part, every, weight.device, worth=1):
+        own.index_add_(0, of[found.chain], found.own)
+        entry = structure.border[found.chain]
+        for rows, columns, of_each in (
+            (found.row[:, None], seen, found.by_landmark),
+            (entry, of[found.chain, None], found.by_chain),
+        ):
+            rows, columns = torch.broadcast_tensors(rows, columns)
+            row.append(rows.flatten())
+            of_sum.append(columns.flatten())
+            value.append(of_each.flatten(0, 1))
+    none = torch.zeros(0, dtype=torch.long, device=weight.device)
+    return own, ChainSums(
+        torch.cat([none, *row]),
+        torch.cat([none, *of_sum]),
+        torch.cat([weight.new_zeros(0, m), *value]),
+    )
