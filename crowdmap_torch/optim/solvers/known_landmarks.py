@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 
 import torch
@@ -70,11 +71,28 @@ class KnownLandmarks:
             found[part.block] = own
         return found
 
+    @cached_property
+    def _of_chains(self) -> Float[Tensor, "n k k"]:
+        """The same of the chains' blocks, but for what joints add."""
+
+        def of_part(of: tuple[Part, Sequence[Lead]]) -> Float[Tensor, "m k k"]:
+            return diagonal_of_inverse(*of, leaves=False)
+
+        leaves, parts = self.structure.plan.leaf_count, self.structure.parts
+        found = torch.empty_like(self.diagonal[leaves:])
+        every = list(zip(parts, self.leads, strict=True))
+        for part, own in zip(parts, in_order(of_part, every, found.device, worth=1), strict=True):
+            found[part.block[part.leaf_count :] - leaves] = own
+        return found
+
     def of_leaves(self) -> Float[Tensor, "l k"]:
         """Variance of each leaf's numbers less those of the block that carries it."""
         plan = self.structure.plan
         assert plan.carrier is not None and plan.leaves is not None
-        of_chain, carrier = self.of_blocks()[plan.leaf_count :], plan.carrier
+        of_chain, carrier = self._of_chains, plan.carrier
+        if self.joints is not None:
+            block = torch.arange(plan.leaf_count, len(self.diagonal), device=of_chain.device)
+            of_chain = of_chain + self.joints.of_blocks(block)
         width = self.structure.width[plan.leaves]
 
         def of_some(at: slice) -> Float[Tensor, "m k"]:
@@ -93,11 +111,16 @@ class KnownLandmarks:
         """Variances of the changes between blocks of chains, leaves marginalised."""
         structure, of = self.structure, changes.of
         leaves = structure.plan.leaf_count
+        first, second = changes.pair.unbind(1)
+        is_within = structure.plan.chain[first] == structure.plan.chain[second]
+        within, across = (torch.nonzero(x)[:, 0] for x in (is_within, ~is_within))
         variance = of.new_zeros(len(changes.pair), of.shape[1])
-        # A change counts at either end, which need not be in one part.
-        end = torch.arange(2, device=of.device).repeat_interleave(len(changes.pair))
-        row = torch.arange(len(changes.pair), device=of.device).repeat(2)
-        block = changes.pair.T.flatten() + leaves
+        # Chains do not go with each other but through what stays, and joints.
+        for end in (first[across], second[across]):
+            variance[across] += (of * (self._of_chains[end] @ of)).sum(1)
+        end = torch.arange(2, device=of.device).repeat_interleave(len(within))
+        row = within.repeat(2)
+        block = changes.pair[within].T.flatten() + leaves
         of_part, number = structure.plan.part_of_blocks[block], structure.number[block]
         # One column at a time: all of them are several times as large as what is solved.
         every = [

@@ -20,13 +20,21 @@ from crowdmap_torch.optim.solvers.block_elimination import Lead
 from crowdmap_torch.optim.solvers.parts import Part
 
 
-def diagonal_of_inverse(part: Part, leads: Sequence[Lead]) -> Float[Tensor, "n k k"]:
-    """Diagonal blocks of the inverse of A, those of a part, by what its rounds leave behind."""
+def diagonal_of_inverse(
+    part: Part, leads: Sequence[Lead], *, leaves: bool = True
+) -> Float[Tensor, "n k k"]:
+    """Diagonal blocks of the inverse of A, those of a part, by what its rounds leave behind.
+
+    Without `leaves` those of its chains alone.
+    """
+    # Leaves are the first round, if there are any.
+    begun = int(not leaves and part.leaf_count > 0)
+    place = part.place[part.leaf_count if begun else 0 :]
     k = leads[0].whiten.shape[-1]
     found = leads[0].whiten.new_zeros(len(part.at_place), k, k)
     # With the block that follows, of those known so far.
     crossed = torch.zeros_like(found)
-    for of_round, lead in zip(reversed(part.rounds), reversed(leads), strict=True):
+    for of_round, lead in zip(reversed(part.rounds[begun:]), reversed(leads[begun:]), strict=True):
         inverse, towards = lead.whiten.mT @ lead.whiten, lead.whiten.mT @ lead.towards
         around = found[of_round.neighbour]
         if of_round.neighbour.shape[1] == 2:
@@ -40,4 +48,4 @@ def diagonal_of_inverse(part: Part, leads: Sequence[Lead]) -> Float[Tensor, "n k
         else:
             with_neighbours = towards @ around[:, 0]
         found[of_round.place] = inverse + with_neighbours @ towards.mT
-    return found[part.place]
+    return found[place]

@@ -59,3 +59,5 @@ def test_blocks_are_those_of_the_dense_inverse(lengths: list[int], leaves: int):
     (part,) = structure(lengths, carrier if leaves else None).parts
     found = diagonal_of_inverse(part, part.leads(diagonal, link))
     assert torch.allclose(found, expected, atol=1e-12)
+    found = diagonal_of_inverse(part, part.leads(diagonal, link), leaves=False)
+    assert torch.allclose(found, expected[leaves:], atol=1e-12)
