@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.bundle import Bundle
@@ -23,7 +23,7 @@ from crowdmap_torch.optim.problem import Values
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, MapCovariance
 from crowdmap_torch.tables import Lanes, Signs
 
-_MOST_PLACES = 500
+_MOST_PLACES = 200
 """Signs, or places along the lanes of a map without any, of which it is asked what all have in common: their covariance is
 dense."""
 
@@ -84,14 +84,27 @@ def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertaint
 
 
 def _shared(covariance: MapCovariance, values: Values, like: Tensor) -> Float[Tensor, "3 3"]:
-    """What the positions of signs have in common; of a map without signs, those along its lanes."""
+    """What the positions of signs have in common; of a map without signs, those along its lanes.
+
+    Of many those that are surest, and others spread over the map: what single places have to themselves is a 200th of it.
+    """
     for name, dim in (("sign", 6), ("lane", 3)):
         every = torch.arange(len(values[name]), device=like.device)
-        every = every[:: max(len(every) // _MOST_PLACES, 1)]
-        if len(every):
-            position = torch.eye(3, dim).to(like).expand(len(every), 3, dim)
-            return covariance.common(LinearFunctions(((name, every),), (position,)))
+        if not len(every):
+            continue
+        position = torch.eye(3, dim).to(like)
+        if len(every) > _MOST_PLACES:
+            own = covariance.of(_places(name, every, position)).diagonal(dim1=-2, dim2=-1).sum(-1)
+            surest = torch.argsort(own, stable=True)[: _MOST_PLACES // 2]
+            spread = every[:: -(-len(every) // (_MOST_PLACES // 2))]
+            every = torch.unique(torch.cat((surest, spread)))
+        return covariance.common(_places(name, every, position))
     return like.new_zeros(3, 3)
+
+
+def _places(name: str, block: Int[Tensor, " n"], position: Float[Tensor, "3 k"]) -> LinearFunctions:
+    """Where blocks of a variable are, as functions of its tangents."""
+    return LinearFunctions(((name, block),), (position.expand(len(block), *position.shape),))
 
 
 def _to_bias(T_world_camera: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 6"]:

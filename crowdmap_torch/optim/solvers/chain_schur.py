@@ -59,6 +59,8 @@ from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.optim.solvers.windows import Batch, Round
 from crowdmap_torch.processes.threads import in_order
 
+_NEXT_TO_NOTHING = 1e-6
+"""Share by which diagonals are raised up to which covariances are as good as those of what is not damped."""
 UNOBSERVED_FLOOR = 1e-9
 """Information added to every landmark before its covariance is read: none that nothing observes spoils the others."""
 
@@ -160,6 +162,10 @@ class Factor:
     """By part and round."""
     reduced: TiledCholesky
     """Of S."""
+    of: Float[Tensor, "e k"]
+    """The gradient a of the equations that they are of."""
+    is_undamped: bool
+    """Whether next to nothing was added to the diagonals."""
 
 
 @dataclass(frozen=True)
@@ -237,10 +243,12 @@ class ChainNormalEquations:
 
     @cached_property
     def known(self) -> KnownLandmarks:
-        """Covariances of eliminated blocks, the landmarks known."""
-        return KnownLandmarks.of(
-            *(self.structure, self.diagonal, self.link), self.coupling, self.hessian
-        )
+        """Covariances of eliminated blocks, the landmarks known; by what the last solve left behind if that is as good."""
+        factor = self.workspace.factor
+        is_own = factor is not None and factor.of is self.eliminated_gradient
+        leads = factor.leads if factor is not None and is_own and factor.is_undamped else None
+        blocks = self.structure, self.diagonal, self.link, self.coupling, self.hessian
+        return KnownLandmarks.of(*blocks, leads)
 
     def factorise(
         self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"]
@@ -261,7 +269,10 @@ class ChainNormalEquations:
         reduced = TiledCholesky.of(system)
         if reduced is None:
             return None
-        self.workspace.factor = Factor(leads, reduced)
+        is_undamped = not bool(
+            (added_x > _NEXT_TO_NOTHING * self.diagonal.diagonal(dim1=-2, dim2=-1)).any()
+        )
+        self.workspace.factor = Factor(leads, reduced, self.eliminated_gradient, is_undamped)
         return system.right_side
 
     def _eliminate(

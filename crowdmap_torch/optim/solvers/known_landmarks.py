@@ -46,13 +46,15 @@ class KnownLandmarks:
         link: Float[Tensor, "e k k"],
         coupling: Mapping[str, Float[Tensor, "f w _"]],
         hessian: TileMatrix,
+        leads: tuple[tuple[Lead, ...], ...] | None = None,
     ) -> KnownLandmarks:
-        """That of normal equations."""
+        """That of normal equations; `leads` where they are known already."""
 
         def led(part: Part) -> tuple[Lead, ...]:
             return part.leads(diagonal, link)
 
-        leads = tuple(in_order(led, structure.parts, diagonal.device, worth=1))
+        if leads is None:
+            leads = tuple(in_order(led, structure.parts, diagonal.device, worth=1))
         joints = joints_of(structure, coupling, hessian, leads)
         return cls(structure, diagonal, link, leads, joints)
 

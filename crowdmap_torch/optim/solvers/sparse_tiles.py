@@ -7,6 +7,7 @@ grows with the tiles, not with the square of the unknowns. Where everything is b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -84,7 +85,7 @@ class TilePattern:
         """Tiles of the diagonal."""
         return len(self.columns)
 
-    @property
+    @cached_property
     def count(self) -> int:
         """All tiles."""
         return self.tiles + sum(len(row) for row in self.columns)
