@@ -59,7 +59,8 @@ ELSEWHERE: Mapping[str, str] = {
 STUDIES, TUTORIAL = "tests/studies/test_study.py", "tests/commands/test_convert.py"
 
 ARGOVERSE = "argoverse2/7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
-REAL: Mapping[str, str] = {ARGOVERSE: ARGOVERSE, "problem.txt": "bal/problem-49-7776-pre.txt"}
+PROBLEM = "problem.txt"
+REAL: Mapping[str, str] = {ARGOVERSE: ARGOVERSE, PROBLEM: "bal/problem-49-7776-pre.txt"}
 """Names of real data, and where they are below the data folder."""
 OLDER = """
 import json, pathlib, sys
@@ -110,6 +111,8 @@ SMALLER: Mapping[str, str] = {
     "crowdmap simulate DRIVES --map crossing.osm": "--frame-rate-hz 5 --journeys 1",
     "crowdmap simulate DRIVES --map LOG": "--journeys 1",
     "crowdmap simulate SIMULATED --map": "--frame-rate-hz 5 --journeys 1",
+    # Four kilometres of streets would be laid out and mapped for the sake of two drives of 70 m.
+    "crowdmap simulate DATA --world city": f"{SMALL} --square-m 500",
     "crowdmap simulate": SMALL,
     # One process: others would import everything once more.
     "crowdmap optimize": "--workers 1",
@@ -202,8 +205,21 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, data in REAL.items():
         if (data_folder() / data).exists():
             (desk / name).parent.mkdir(exist_ok=True)
-            (desk / name).symlink_to(data_folder() / data)
+            if name == PROBLEM:
+                write_few_points(data_folder() / data, desk / name)
+            else:
+                (desk / name).symlink_to(data_folder() / data)
     return desk
+
+
+def write_few_points(problem: Path, out: Path, count: int = 500) -> None:
+    """A problem of bundle adjustment in the large with the first `count` of its points alone: all of them take a minute."""
+    head, *lines = problem.read_text().splitlines()
+    cameras, points, rows = (int(number) for number in head.split())
+    seen = [line for line in lines[:rows] if int(line.split()[1]) < count]
+    unknowns = lines[rows : rows + 9 * cameras + 3 * min(count, points)]
+    head = f"{cameras} {min(count, points)} {len(seen)}"
+    out.write_text("\n".join((head, *seen, *unknowns, "")))
 
 
 @pytest.fixture(scope="module")
