@@ -218,7 +218,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(wrong: Path) -> FleetCalibration:
-    return mapper.build_map(load_dataset(wrong), MapperConfig(), workers=2).uncertainty.calibration
+    return mapper.build_map(load_dataset(wrong), MapperConfig()).uncertainty.calibration
 
 
 def test_what_is_wrong_with_cars_is_found(wrong: Path, found: FleetCalibration) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -30,10 +31,17 @@ def registered(world: World) -> Crowd:
     return register_crowd(world.crowd, PositioningNoise(), CrowdConfig())
 
 
+@cache
+def without_outage(seed: int) -> tuple[World, Crowd]:
+    """A world, and what is found in it as it is."""
+    world = make_world(seed, journeys=_JOURNEYS, bias_m=0.3, fragments=0.0, ghosts=0.0)
+    return world, registered(world)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_an_outage_is_found_and_nothing_else(seed: int):
-    world = make_world(seed, journeys=_JOURNEYS, bias_m=0.3, fragments=0.0, ghosts=0.0)
-    assert registered(world).report.outages == ()
+    world, right = without_outage(seed)
+    assert right.report.outages == ()
     crowd = registered(with_outage(world, 3, 4.0))
     assert {outage.journey for outage in crowd.report.outages} == {3}
     begin = min(outage.from_m for outage in crowd.report.outages)
@@ -46,8 +54,7 @@ def test_an_outage_is_found_and_nothing_else(seed: int):
 
 
 def test_a_sign_whose_place_its_drive_hardly_knows_is_no_outage():
-    world = make_world(0, journeys=_JOURNEYS, bias_m=0.3, fragments=0.0, ghosts=0.0)
-    crowd = registered(world)
+    world, crowd = without_outage(0)
     signs = world.crowd.signs
     displaced = with_outage(world, 3, 4.0).crowd.signs
     unknown = displaced.covariance + 4.0 * torch.eye(3, dtype=torch.float64)
@@ -68,8 +75,8 @@ def test_a_sign_whose_place_its_drive_hardly_knows_is_no_outage():
 
 
 def test_two_drives_that_are_off_alike_do_not_make_signs():
-    world = make_world(2, journeys=_JOURNEYS, bias_m=0.3, fragments=0.0, ghosts=0.0)
-    count = len(registered(world).heads)
+    world, right = without_outage(2)
+    count = len(right.heads)
     crowd = registered(with_outage(with_outage(world, 3, 4.0), 7, 4.0))
     assert {outage.journey for outage in crowd.report.outages} == {3, 7}
     assert len(crowd.heads) == count
