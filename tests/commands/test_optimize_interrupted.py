@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -17,9 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from worlds.drives import write_tiny
-from worlds.programs import PATIENCE_S, begin
-from worlds.runs import Said, journeys_of
+from worlds.runs import ROUGH, Said, journeys_of
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
@@ -28,30 +24,7 @@ from crowdmap_torch.commands import optimize as optimize_command
 from crowdmap_torch.config import load_config
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.mapper import map_journey
-from crowdmap_torch.runs.folder import RunFolder
-from crowdmap_torch.soak.child import children, ends
 from crowdmap_torch.soak.interrupted import differences
-
-ROUGH = """\
-adjust: {lm: {max_iterations: 6}}
-sign_triangulation: {fit: {rounds: 1, lm: {max_iterations: 6}, coarse_lm: {max_iterations: 3}}}
-crowd: {rounds: 1}
-"""
-"""It is not the map that is judged here."""
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three drives that are mapped in a second."""
-    return write_tiny(tmp_path_factory.mktemp("small") / "dataset", frame_rate_hz=3.0, length_m=60)
-
-
-@pytest.fixture(scope="module")
-def rough(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A configuration that takes few steps."""
-    path = tmp_path_factory.mktemp("config") / "rough.yaml"
-    path.write_text(ROUGH)
-    return path
 
 
 @pytest.fixture
@@ -386,66 +359,3 @@ def test_a_disk_that_may_only_be_read_is_one_line(
         assert said.err.startswith(f"crowdmap optimize: {place}")
         assert "Read-only file system" in said.err
     assert same_map(out, run)
-
-
-def test_a_folder_that_another_run_writes_is_refused_before_anything_is_read(
-    optimize, tmp_path: Path
-):
-    folder = RunFolder(tmp_path / "run")
-    with folder.claimed():
-        said = optimize(tmp_path / "no dataset", folder.path)
-    assert said.code == 2 and said.err.count("\n") == 1 and "writes there" in said.err
-
-
-@pytest.mark.parametrize("place", ["file/run", "link", "/proc/run", "x" * 300])
-def test_a_place_for_no_folder_is_refused_before_anything_is_read(
-    optimize, tmp_path: Path, place: str
-):
-    (tmp_path / "file").touch()
-    (tmp_path / "link").symlink_to(tmp_path / "nothing")
-    said = optimize(tmp_path / "no dataset", tmp_path / place)
-    assert said.code == 2 and said.err.count("\n") == 1 and "no dataset" not in said.err
-
-
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="nobody tells who are children")
-@pytest.mark.parametrize(
-    ("stage", "workers", "number", "code"),
-    [("single journeys", "2", signal.SIGINT, 130), ("clusters", "1", signal.SIGTERM, 143)],
-)
-def test_a_signal_is_one_line_and_leaves_nobody_behind(
-    small: Path,
-    rough: Path,
-    tmp_path: Path,
-    stage: str,
-    workers: str,
-    number: signal.Signals,
-    code: int,
-):
-    out = tmp_path / "run"
-    program = begin(
-        *("-m", "crowdmap_torch", "optimize", str(small), "--out", str(out)),
-        *("--config", str(rough), "--workers", workers),
-    )
-    assert program.stderr is not None
-    said = [program.stderr.readline()]
-    while not said[-1].startswith(stage):
-        assert said[-1], said
-        said.append(program.stderr.readline())
-    if stage == "single journeys":
-        # Workers are there since the data set was read.
-        assert len(children(program.pid)) == 2
-    begun_by_it = children(program.pid)
-    program.send_signal(number)
-    begun = time.monotonic()
-    _, rest = program.communicate(timeout=PATIENCE_S)
-    assert program.returncode == code
-    # Five seconds are promised on a machine that has nothing else to do.
-    assert time.monotonic() - begun < 30
-    *progress, last = rest.splitlines()
-    assert last == (
-        f"crowdmap optimize: ended by {number.name}; what was finished is kept: "
-        "the same command with --resume goes on"
-    )
-    assert all(line.startswith(("clusters", "bundle", "single")) for line in progress)
-    assert all(ends(worker, PATIENCE_S) for worker in begun_by_it)
-    assert not (out / "run.lock").exists() and not (out / "map").exists()

@@ -40,10 +40,11 @@ def drives(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def runs(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def runs(drives: Path, rough: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The map of a run in tiles, kept aside, and of the same run again without them, over the first."""
     folder = tmp_path_factory.mktemp("runs")
     run = ["optimize", str(drives), "--out", str(folder / "run"), "--workers", "1", "-q"]
+    run += ["--config", str(rough)]
     assert main([*run, "--tiles"]) == 0
     shutil.copytree(folder / "run", folder / "tiled")
     assert main([*run, "--overwrite"]) == 0
