@@ -39,8 +39,8 @@ def short() -> MapperConfig:
 
 
 @pytest.fixture(scope="module")
-def transfers() -> Iterator[Transfers]:
-    """The device is there for all tests of this file."""
+def transfers(first_here: Stages) -> Iterator[Transfers]:
+    """The device is there for all tests of this file, but not for what is made before it: every operation costs more."""
     before = torch.are_deterministic_algorithms_enabled()
     with pretend_device() as counted:
         yield counted
