@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,15 @@ if os.environ.get("CROWDMAP_CHECK_SHAPES"):
 @pytest.fixture(scope="module", autouse=True)
 def annotations_are_checked_in_every_file() -> None:
     shape_checks.begin_file()
+
+
+@pytest.fixture(autouse=True)
+def threads_stay_as_they_were() -> Iterator[None]:
+    """Benchmarks choose their threads; where they are more than cores are free, what follows is many times slower."""
+    before = torch.get_num_threads()
+    yield
+    if torch.get_num_threads() != before:
+        torch.set_num_threads(before)
 
 
 ROOT = Path(__file__).parent.parent
