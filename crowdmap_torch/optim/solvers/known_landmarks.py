@@ -91,10 +91,7 @@ class KnownLandmarks:
         """Variance of each leaf's numbers less those of the block that carries it."""
         plan = self.structure.plan
         assert plan.carrier is not None and plan.leaves is not None
-        of_chain, carrier = self._of_chains, plan.carrier
-        if self.joints is not None:
-            block = torch.arange(plan.leaf_count, len(self.diagonal), device=of_chain.device)
-            of_chain = of_chain + self.joints.of_blocks(block)
+        of_chain, carrier, joints = self._of_chains, plan.carrier, self.joints
         width = self.structure.width[plan.leaves]
 
         def of_some(at: slice) -> Float[Tensor, "m k"]:
@@ -102,7 +99,11 @@ class KnownLandmarks:
             # The leaf goes with its carrier by -H^-1 times their link.
             lags = alone @ self.link[at]
             lags.diagonal(dim1=-2, dim2=-1).add_(1)
-            left = alone + lags @ of_chain[carrier[at]] @ lags.mT
+            carried, by = torch.unique(carrier[at], return_inverse=True)
+            of_carrier = of_chain[carried]
+            if joints is not None:
+                of_carrier = of_carrier + joints.of_blocks(carried + plan.leaf_count)
+            left = alone + lags @ of_carrier[by] @ lags.mT
             return left.diagonal(dim1=-2, dim2=-1)[:, :width]
 
         bounds = [*range(0, max(plan.leaf_count, 1), _AT_ONCE), plan.leaf_count]
