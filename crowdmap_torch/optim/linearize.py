@@ -19,7 +19,7 @@ from crowdmap_torch.optim.problem import (
     Values,
     Variable,
 )
-from crowdmap_torch.optim.robust import JointLoss
+from crowdmap_torch.optim.robust import is_joint
 from crowdmap_torch.processes.threads import in_order
 
 CHUNK_ROWS = 1 << 13
@@ -33,7 +33,7 @@ def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
         slots=tuple((name, block[index]) for name, block in term.slots),
         constants=tuple(_some_rows(constant, index) for constant in term.constants),
         weight=None if term.weight is None else term.weight[index],
-        loss=term.loss.of_rows(index) if isinstance(term.loss, JointLoss) else term.loss,
+        loss=term.loss.of_rows(index) if is_joint(term.loss) else term.loss,
         shared=None if term.shared is None else term.shared.of_rows(index),
     )
 
@@ -47,7 +47,7 @@ def _some_rows(constant: Float[Tensor, "m ..."], index: slice | Tensor) -> Float
 
 def chunks(term: CostTerm, size: int = CHUNK_ROWS) -> Iterator[tuple[slice, CostTerm]]:
     """The term in pieces of at most `size` rows; those that are joined stay in one piece, however many they are."""
-    joint = term.loss if isinstance(term.loss, JointLoss) else term.shared
+    joint = term.loss if is_joint(term.loss) else term.shared
     start = 0
     while start < len(term):
         stop = min(start + size, len(term))
