@@ -42,6 +42,7 @@ class AdjustConfig(Settings):
             move_tolerance=0.03,
             initial_damping=1e-9,
             max_stretch=3.0,
+            corrections=8,
         )
     )
     """The solver; its tolerances count once the scales stand still."""

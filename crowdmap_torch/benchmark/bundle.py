@@ -112,6 +112,7 @@ def solve(
         "setup_s": ready - start,
         "solve_s": done - ready,
         "iterations": first.iterations + last.iterations,
+        "corrections": first.corrections + last.corrections,
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
         "cost": free_corners.cost(problem, q, p, X),
         "reason": last.reasons[0],
@@ -208,12 +209,15 @@ def _race(size: str, options: argparse.Namespace) -> dict[str, dict[str, float]]
             print(f"{head} {failed[name]}")
             continue
         medians[name] = middle = {
-            key: statistics.median(one[key] for one in done)
-            for key in ("setup_s", "solve_s", "iterations", "peak_gb", "cost")
+            key: statistics.median(one.get(key, 0) for one in done)
+            for key in ("setup_s", "solve_s", "iterations", "corrections", "peak_gb", "cost")
         }
+        steps = f"{middle['iterations']:.0f}"
+        if middle["corrections"]:
+            steps += f"+{middle['corrections']:.0f}"
         print(
             f"{head} {middle['setup_s']:>6.2f} s {middle['solve_s']:>6.2f} s "
-            f"{middle['iterations']:>6.0f} {middle['peak_gb']:>5.2f} GB {middle['cost']:>16.4f}",
+            f"{steps:>6} {middle['peak_gb']:>5.2f} GB {middle['cost']:>16.4f}",
             flush=True,
         )
     return medians

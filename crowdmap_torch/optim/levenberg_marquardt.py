@@ -14,10 +14,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from crowdmap_torch.optim.corrections import Point, corrected
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
 from crowdmap_torch.optim.solvers.dense import DenseBackend
-from crowdmap_torch.optim.solvers.normal_equations import Backend, NormalEquations
+from crowdmap_torch.optim.solvers.normal_equations import (
+    Backend,
+    Correctable,
+    NormalEquations,
+    Step,
+)
 from crowdmap_torch.ranges import Damping, Factor, RoundsOrNone, Settings, Share
 
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE, CONVERGED_MOVE = range(6)
@@ -58,6 +64,12 @@ class LmConfig(Settings):
     max_stretch: Factor = 1.0
     """Longest that an accepted step may be made, as a multiple, where the model proved wrong about its length: the
     weights of robust losses overrate the curvature. 1: never; a change costs one more evaluation of the cost."""
+    corrections: RoundsOrNone = 0
+    """Most further steps that a step is followed by with its own matrix, at new gradients (`corrections`): a fraction of the
+    work each. A step ends with those that no longer do what its matrix promises. 0: none."""
+    correct_below: Share = 0.005
+    """Corrected are steps that promise to lower the cost by less than this share of it: while it falls by more, the weights
+    of robust losses change too much for the matrix to serve again. Such steps are not made longer as well."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +94,8 @@ class LmState:
     normal: NormalEquations | None = field(default=None, repr=False)
     """Normal equations at the values; None where they moved since, or the problem changed."""
     iterations: int = 0
+    corrections: int = 0
+    """How many were tried in all steps."""
     linearizations: int = 0
 
     @property
@@ -125,23 +139,27 @@ def step(
     running = state.reason == RUNNING
     proposal = normal.solve(state.damping)
     length = torch.ones_like(state.damping)
-    candidate, term_cost, cost = _trial(problem, state.values, proposal.delta, length)
-    decrease = normal.cost - cost
-    gain = decrease / proposal.predicted.clamp_min(torch.finfo(cost.dtype).tiny)
-    accepted = running & proposal.solved & cost.isfinite() & (decrease > 0)
-    if config.max_stretch > 1:
+    point = _to_be_corrected(problem, state.values, normal, proposal, config)
+    if point is None:
+        trial = _trial(problem, state.values, proposal.delta, length)
+    else:
+        trial = point.values, point.costs.by_term, point.costs.total
+    decrease = normal.cost - trial[2]
+    gain = decrease / proposal.predicted.clamp_min(torch.finfo(decrease.dtype).tiny)
+    accepted = running & proposal.solved & trial[2].isfinite() & (decrease > 0)
+    if config.max_stretch > 1 and point is None:
         # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
         best = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(accepted, length)
         if bool(((best - 1).abs() > _NEAR_BEST).any()):
             other = _trial(problem, state.values, proposal.delta, best)
-            length = torch.where(other[2] < cost, best, length)
-            candidate, term_cost, cost = _better(problem, (candidate, term_cost, cost), other)
-            decrease = normal.cost - cost
+            length = torch.where(other[2] < trial[2], best, length)
+            trial = _better(problem, trial, other)
+            decrease = normal.cost - trial[2]
 
     shrink = (1 - (2 * gain - 1) ** 3).clamp(1 / 3, 2.0)
     damping = torch.where(accepted, state.damping * shrink, state.damping * state.growth)
     damping = torch.where(running, damping, state.damping).clamp_min(config.min_damping)
-    growth = torch.where(accepted, torch.full_like(cost, 2.0), state.growth * 2)
+    growth = torch.where(accepted, torch.full_like(gain, 2.0), state.growth * 2)
 
     reason = state.reason.clone()
     tolerance = config.cost_tolerance * normal.cost
@@ -155,7 +173,19 @@ def step(
     reason[running & tiny & (reason == RUNNING)] = CONVERGED_STEP
     reason[running & ~accepted & (damping > config.max_damping) & (reason == RUNNING)] = STALLED
 
+    tried = 0
+    if point is not None and bool(accepted & (reason == RUNNING)):
+        assert isinstance(normal, Correctable)
+        after = corrected(
+            *(problem, normal, proposal.delta, point),
+            most=config.corrections,
+            cost_tolerance=config.cost_tolerance,
+        )
+        trial, tried = (after.at.values, after.at.costs.by_term, after.at.costs.total), after.count
+        reason[after.converged] = CONVERGED_COST
+
     moved = bool(accepted.any())
+    candidate, term_cost, cost = trial
     return replace(
         state,
         values=_merge(problem, state.values, candidate, accepted) if moved else state.values,
@@ -174,10 +204,23 @@ def step(
         # After a rejected step the linearisation still holds.
         normal=None if moved else normal,
         iterations=state.iterations + 1,
+        corrections=state.corrections + tried,
     )
 
 
-_Trial = tuple[dict[str, Tensor], dict[str, Tensor], Tensor]
+def _to_be_corrected(
+    problem: Problem, values: Values, normal: NormalEquations, proposal: Step, config: LmConfig
+) -> Point | None:
+    """Where the step leads, with the gradient there, if it is one to be corrected."""
+    if not config.corrections or not isinstance(normal, Correctable):
+        return None
+    small = proposal.predicted < config.correct_below * normal.cost
+    if not bool((proposal.solved & small).all()):
+        return None
+    return Point.of(problem, retract(problem, values, proposal.delta), proposal.delta)
+
+
+_Trial = tuple[Values, Mapping[str, Tensor], Tensor]
 """Values, costs by term, and cost."""
 
 

@@ -134,6 +134,12 @@ def row_blocks(term: CostTerm, variables: Mapping[str, Variable], values: Values
     return RowBlocks(rho, _pulled(jacobians, residual * weight), hessian)
 
 
+def row_gradients(term: CostTerm, variables: Mapping[str, Variable], values: Values) -> RowBlocks:
+    """Every row's gradient, without Hessian blocks."""
+    residual, jacobians, weight, rho = _weighted(term, variables, values)
+    return RowBlocks(rho, _pulled(jacobians, residual * weight), {})
+
+
 def dense(jacobians: tuple[Jacobian, ...]) -> tuple[Float[Tensor, "d _ m"], ...]:
     """All entries of the Jacobians of a term."""
     whole: list[Tensor] = []

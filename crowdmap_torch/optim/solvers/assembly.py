@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, chunks, rows
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, chunks, row_gradients, rows
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
 from crowdmap_torch.processes.threads import in_order
 
@@ -102,6 +102,21 @@ def assemble(
             add(chunk)
         by_term[name] = cost
     return Costs(torch.stack(list(by_term.values())).sum(0), by_term)
+
+
+def cost_and_gradient(problem: Problem, values: Values) -> tuple[Costs, dict[str, Tensor]]:
+    """The cost of every term, and the gradient [n, k] by the tangents of every variable."""
+    gradient = {
+        name: values[name].new_zeros(kind.tangent_dim, len(values[name]))
+        for name, kind in problem.variables.items()
+    }
+
+    def add(chunk: TermRows) -> None:
+        for (name, block), pull in zip(chunk.slots, chunk.blocks.gradient, strict=True):
+            gradient[name].index_add_(1, block, pull)
+
+    costs = assemble(problem, values, row_gradients, add)
+    return costs, {name: of.mT.contiguous() for name, of in gradient.items()}
 
 
 def pairs(count: int) -> Iterator[tuple[int, int]]:

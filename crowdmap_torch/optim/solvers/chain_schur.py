@@ -49,6 +49,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
     ChainChanges,
     Step,
     StepPart,
+    Tangents,
     failed_step,
     solved_step,
 )
@@ -196,13 +197,24 @@ class ChainNormalEquations:
         if right_side is None:
             return failed_step(self.unpack(self.eliminated_gradient, self.gradient), self.cost)
         y = -self.solve_reduced(right_side[:, None])[:, 0]
-        x = self.substitute(y)
+        x = self.substitute(y, self.eliminated_gradient)
         parts = (
             StepPart(x[None], self.eliminated_gradient[None], added_x[None]),
             StepPart(y[None], self.gradient[None], added_y[None]),
         )
         last, count = (StepPart.alone(y, right_side),), self.structure.where.used.sum(1).to(y)
         return solved_step(self.unpack(x, y), *parts, last=last, count=count)
+
+    @property
+    def tangent_gradient(self) -> dict[str, Tensor]:
+        """The gradient by variable."""
+        return self.unpack(self.eliminated_gradient, self.gradient)
+
+    def correct(self, gradient: Tangents) -> dict[str, Tensor]:
+        """The step for another gradient, by the last factors."""
+        a, b = self.structure.stack(gradient), self.structure.where.pack(gradient)[0]
+        y = -self.solve_reduced((b - self.couple_all(self.solve_alone(a)))[:, None])[:, 0]
+        return self.unpack(self.substitute(y, a), y)
 
     def unpack(self, x: Float[Tensor, "e k ..."], y: Float[Tensor, "r ..."]) -> dict[str, Tensor]:
         """Tangents by variable."""
@@ -328,20 +340,38 @@ class ChainNormalEquations:
         assert self.workspace.factor is not None
         return self.structure.solve(self.workspace.factor.leads, right_side)
 
+    def couple_all(self, x: Float[Tensor, "e k"]) -> Float[Tensor, " r"]:
+        """What eliminated blocks are coupled to: B x, and F^T x of the border."""
+        structure, total = self.structure, torch.zeros_like(self.gradient)
+        for name, block in self.coupling.items():
+            coupling = structure.couplings.factors[name]
+            product = block @ x.index_select(0, coupling.block)[:, : block.shape[2], None]
+            total.index_add_(0, coupling.column.flatten(), product.flatten())
+        told = (self.border_link.mT @ x[..., None])[..., 0]
+        by_chain = told.new_zeros(structure.border.shape).index_add_(0, structure.owner, told)
+        return total.index_add_(0, structure.border.flatten(), by_chain.flatten())
+
     def couple_back(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
         """B^T y."""
         total = torch.zeros_like(self.eliminated_gradient)
         for name, block in self.coupling.items():
             coupling = self.structure.couplings.factors[name]
-            product = (y[coupling.column][:, None] @ block)[:, 0]
+            of_factor = y.index_select(0, coupling.column.flatten()).view(coupling.column.shape)
+            product = (of_factor[:, None] @ block)[:, 0]
             total[:, : product.shape[1]].index_add_(0, coupling.block, product)
         return total
 
-    def substitute(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
+    def substitute(
+        self, y: Float[Tensor, " r"], gradient: Float[Tensor, "e k"]
+    ) -> Float[Tensor, "e k"]:
         """The steps of the eliminated blocks where what stays makes the step y, by the last factors."""
         of_border = y[self.structure.border][self.structure.owner]
-        linked = self.eliminated_gradient + (self.border_link @ of_border[..., None])[..., 0]
-        return -self.solve_eliminated((linked + self.couple_back(y))[..., None])[..., 0]
+        linked = gradient + (self.border_link @ of_border[..., None])[..., 0]
+        return -self.solve_alone(linked + self.couple_back(y))
+
+    def solve_alone(self, right_side: Float[Tensor, "e k"]) -> Float[Tensor, "e k"]:
+        """A^-1 of one right-hand side, by the last factors."""
+        return self.solve_eliminated(right_side[..., None])[..., 0]
 
 
 def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> ChainNormalEquations:

@@ -198,6 +198,20 @@ class NormalEquations(Protocol):
 
 
 @runtime_checkable
+class Correctable(NormalEquations, Protocol):
+    """Those of one problem whose last factors serve other gradients too."""
+
+    @property
+    def tangent_gradient(self) -> Tangents:
+        """The gradient by variable."""
+        ...
+
+    def correct(self, gradient: Tangents) -> Tangents:
+        """The step for another gradient, by the factors of the last `solve`."""
+        ...
+
+
+@runtime_checkable
 class MapEquations(NormalEquations, Protocol):
     """Those of a map: the observers' blocks form chains, and are eliminated."""
 

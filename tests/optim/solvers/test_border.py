@@ -48,6 +48,20 @@ def test_a_place_has_nothing_to_do_with_drives_elsewhere():
 
 
 @pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
+def test_the_last_factors_serve_another_gradient(world):
+    problem, values, plan = world()
+    ours, dense = (b.assemble(problem, values) for b in (ChainBackend(plan), DenseBackend()))
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    step = ours.solve(damping)
+    for name, own in ours.correct(ours.tangent_gradient).items():
+        torch.testing.assert_close(own, step.delta[name], rtol=1e-9, atol=1e-12)
+    other = {name: torch.cos(3 * x + 1) for name, x in ours.tangent_gradient.items()}
+    asked = replace(dense, gradient=dense.where.pack(other)).solve(damping).delta
+    for name, own in ours.correct(other).items():
+        torch.testing.assert_close(own, asked[name], rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
 def test_a_step_tells_by_how_many_sigmas_landmarks_and_border_move(world):
     problem, values, plan = world()
     dense = DenseBackend().assemble(problem, values)

@@ -121,6 +121,22 @@ def test_elimination_gives_the_dense_step(lengths, group_size, batch_bytes, part
         torch.testing.assert_close(ours.norm, theirs.norm)
 
 
+@pytest.mark.parametrize("lengths", [[1], [10, 1, 9, 8], [85, 40]])
+@pytest.mark.parametrize("parts", [1, 3])
+def test_the_last_factors_serve_another_gradient(lengths, parts):
+    built, values, chain = problem(lengths)
+    plan = in_parts(EliminationPlan("pose", chain), parts)
+    ours, dense = (b.assemble(built, values) for b in (ChainBackend(plan), DenseBackend()))
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    step = ours.solve(damping)
+    for name, own in ours.correct(ours.tangent_gradient).items():
+        torch.testing.assert_close(own, step.delta[name], rtol=1e-9, atol=1e-12)
+    other = {name: torch.cos(3 * x + 1) for name, x in ours.tangent_gradient.items()}
+    asked = replace(dense, gradient=dense.where.pack(other)).solve(damping).delta
+    for name, own in ours.correct(other).items():
+        torch.testing.assert_close(own, asked[name], rtol=1e-8, atol=1e-10)
+
+
 @pytest.mark.parametrize("lengths", [[1], [10, 1, 9], [85, 40]])
 @pytest.mark.parametrize("parts", [1, 2])
 def test_leaves_and_chain_give_the_dense_step(lengths, parts):
