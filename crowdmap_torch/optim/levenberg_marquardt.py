@@ -69,7 +69,7 @@ class LmConfig(Settings):
     work each. A step ends with those that no longer do what its matrix promises. 0: none."""
     correct_below: Share = 0.005
     """Corrected are steps that promise to lower the cost by less than this share of it: while it falls by more, the weights
-    of robust losses change too much for the matrix to serve again. Such steps are not made longer as well."""
+    of robust losses change too much for the matrix to serve again. They are made longer only where corrections fail."""
 
 
 @dataclass(frozen=True)
@@ -147,33 +147,15 @@ def step(
     decrease = normal.cost - trial[2]
     gain = decrease / proposal.predicted.clamp_min(torch.finfo(decrease.dtype).tiny)
     accepted = running & proposal.solved & trial[2].isfinite() & (decrease > 0)
-    if config.max_stretch > 1 and point is None:
-        # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
-        best = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(accepted, length)
-        if bool(((best - 1).abs() > _NEAR_BEST).any()):
-            other = _trial(problem, state.values, proposal.delta, best)
-            length = torch.where(other[2] < trial[2], best, length)
-            trial = _better(problem, trial, other)
-            decrease = normal.cost - trial[2]
 
     shrink = (1 - (2 * gain - 1) ** 3).clamp(1 / 3, 2.0)
     damping = torch.where(accepted, state.damping * shrink, state.damping * state.growth)
     damping = torch.where(running, damping, state.damping).clamp_min(config.min_damping)
     growth = torch.where(accepted, torch.full_like(gain, 2.0), state.growth * 2)
+    tried = replace(state, accepted=accepted, damping=damping, stretch=length)
+    reason = _reason(state, tried, proposal, decrease, normal.cost, config)
 
-    reason = state.reason.clone()
-    tolerance = config.cost_tolerance * normal.cost
-    # Where the model itself promises next to nothing, a rejection is rounding and not a bad step.
-    nothing_left = proposal.solved & ~accepted & (proposal.predicted <= 1e-3 * tolerance)
-    reason[running & ((accepted & (decrease <= tolerance)) | nothing_left)] = CONVERGED_COST
-    lost = accepted & (proposal.in_sigmas * length < config.move_tolerance)
-    lost &= state.damping <= _UNDAMPED
-    reason[running & lost & (reason == RUNNING)] = CONVERGED_MOVE
-    tiny = proposal.solved & (proposal.norm < config.step_tolerance)
-    reason[running & tiny & (reason == RUNNING)] = CONVERGED_STEP
-    reason[running & ~accepted & (damping > config.max_damping) & (reason == RUNNING)] = STALLED
-
-    tried = 0
+    after = None
     if point is not None and bool(accepted & (reason == RUNNING)):
         assert isinstance(normal, Correctable)
         after = corrected(
@@ -181,8 +163,18 @@ def step(
             most=config.corrections,
             cost_tolerance=config.cost_tolerance,
         )
-        trial, tried = (after.at.values, after.at.costs.by_term, after.at.costs.total), after.count
+    if after is not None and after.at is not point:
+        trial = after.at.values, after.at.costs.by_term, after.at.costs.total
         reason[after.converged] = CONVERGED_COST
+    elif config.max_stretch > 1:
+        # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
+        best = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(accepted, length)
+        if bool(((best - 1).abs() > _NEAR_BEST).any()):
+            other = _trial(problem, state.values, proposal.delta, best)
+            length = torch.where(other[2] < trial[2], best, length)
+            trial = _better(problem, trial, other)
+            tried, decrease = replace(tried, stretch=length), normal.cost - trial[2]
+            reason = _reason(state, tried, proposal, decrease, normal.cost, config)
 
     moved = bool(accepted.any())
     candidate, term_cost, cost = trial
@@ -204,8 +196,35 @@ def step(
         # After a rejected step the linearisation still holds.
         normal=None if moved else normal,
         iterations=state.iterations + 1,
-        corrections=state.corrections + tried,
+        corrections=state.corrections + (0 if after is None else after.count),
     )
+
+
+def _reason(
+    before: LmState,
+    after: LmState,
+    proposal: Step,
+    decrease: Float[Tensor, " groups"],
+    cost: Float[Tensor, " groups"],
+    config: LmConfig,
+) -> Int[Tensor, " groups"]:
+    """Why each problem ends with a step that lowered its cost by so much, if it does.
+
+    Of the state `after` the step whether it is accepted, how long it was made, and the damping count.
+    """
+    running, accepted = before.reason == RUNNING, after.accepted
+    reason, tolerance = before.reason.clone(), config.cost_tolerance * cost
+    # Where the model itself promises next to nothing, a rejection is rounding and not a bad step.
+    nothing_left = proposal.solved & ~accepted & (proposal.predicted <= 1e-3 * tolerance)
+    reason[running & ((accepted & (decrease <= tolerance)) | nothing_left)] = CONVERGED_COST
+    lost = accepted & (proposal.in_sigmas * after.stretch < config.move_tolerance)
+    lost &= before.damping <= _UNDAMPED
+    reason[running & lost & (reason == RUNNING)] = CONVERGED_MOVE
+    tiny = proposal.solved & (proposal.norm < config.step_tolerance)
+    reason[running & tiny & (reason == RUNNING)] = CONVERGED_STEP
+    too_damped = ~accepted & (after.damping > config.max_damping)
+    reason[running & too_damped & (reason == RUNNING)] = STALLED
+    return reason
 
 
 def _to_be_corrected(

@@ -16,6 +16,7 @@ from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.assembly import cost_and_gradient
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
+from crowdmap_torch.optim.solvers.normal_equations import StepPart, solved_step
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 
 CONFIG = lm.LmConfig(max_iterations=40, cost_tolerance=1e-10, initial_damping=1e-9, max_stretch=3.0)
@@ -100,7 +101,9 @@ class _Rough:
         return {"x": self.gradient[None]}
 
     def solve(self, damping):
-        raise NotImplementedError
+        step = -torch.linalg.solve(self.matrix, self.gradient)
+        part = StepPart(step[None], self.gradient[None], torch.zeros_like(step)[None])
+        return solved_step({"x": step[None]}, part)
 
     def covariance(self):
         raise NotImplementedError
@@ -145,6 +148,29 @@ def test_a_correction_that_raises_the_cost_is_not_taken():
     found = corrected(problem, normal, step, first, most=5, cost_tolerance=1e-12)
     assert found.at.costs.total <= first.costs.total
     assert not bool(found.converged)
+
+
+@dataclass
+class _OnlyOnce:
+    """A back end with the same equations always."""
+
+    normal: _Rough
+
+    def assemble(self, problem, values):
+        return self.normal
+
+
+def test_where_corrections_fail_the_step_is_made_longer():
+    problem, values, normal = _bowl()
+    # Twice the curvature everywhere: the step leads half the way, and its factors are lost.
+    normal.matrix = 2 * DenseBackend().assemble(problem, values).hessian[0]
+    normal.correct = lambda gradient: {"x": torch.full_like(gradient["x"], torch.nan)}
+    config = replace(CONFIG, corrections=5, correct_below=1.0)
+    state = lm.init(problem, values, config)
+    state = lm.step(problem, state, config, backend=_OnlyOnce(normal))
+    assert state.corrections == 1
+    torch.testing.assert_close(state.stretch, torch.full_like(state.cost, 2.0))
+    torch.testing.assert_close(state.values["x"], torch.zeros_like(values["x"]))
 
 
 def test_equations_without_kept_factors_take_plain_steps():

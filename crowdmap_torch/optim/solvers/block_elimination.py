@@ -91,14 +91,19 @@ def solve_rounds(
         own = slice(of_round.place.start - gone, of_round.place.stop - gone)
         whitened = lead.whiten @ rest[own]
         rest[own] = whitened
-        fill = (lead.towards.mT @ whitened).view(-1, *rest.shape[1:])
+        fill = _turned(lead.towards, whitened).view(-1, *rest.shape[1:])
         rest.index_add_(0, of_round.neighbour.flatten() - gone, fill)
     solution = torch.zeros_like(rest)
     for of_round, lead in zip(reversed(rounds), reversed(leads), strict=True):
         own = slice(of_round.place.start - gone, of_round.place.stop - gone)
         beside = solution[of_round.neighbour - gone].flatten(1, 2)
-        solution[own] = lead.whiten.mT @ (rest[own] + lead.towards @ beside)
+        solution[own] = _turned(lead.whiten, rest[own] + lead.towards @ beside)
     return solution
+
+
+def _turned(matrix: Float[Tensor, "e k l"], x: Float[Tensor, "e k c"]) -> Float[Tensor, "e l c"]:
+    """`matrix^T x`; of one column summed along the rows, which takes half as long as small products turned around."""
+    return (matrix * x).sum(1)[..., None] if x.shape[-1] == 1 else matrix.mT @ x
 
 
 @dataclass(frozen=True)
