@@ -46,6 +46,7 @@ from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.processes.interrupts import keeping
+from crowdmap_torch.processes.memory import keep_in_one_place
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.ranges import Count, Workers, argument
 from crowdmap_torch.report.fates import missing_findings
@@ -150,6 +151,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Maps `options.dataset` into the folder `options.out`; the exit code."""
+    keep_in_one_place()
     with input_read():
         config = load_config(options.config)
         if options.calibration == _OFF:

@@ -7,6 +7,8 @@ from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
+_ARENA_MAX = -8
+"""`M_ARENA_MAX` of malloc.h."""
 _STATUS, _PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
@@ -26,6 +28,16 @@ def restart_peak() -> None:
     """From now on `peak_bytes` tells of what comes, where the system can be told to forget (Linux)."""
     with suppress(OSError):
         _PEAK.write_text("5")
+
+
+def keep_in_one_place() -> None:
+    """From now on threads share what was freed (glibc); to be called before there are any.
+
+    Each would keep a heap of its own: an eighth of what a map of 25 drives takes, and no time is saved by it.
+    """
+    library = _library()
+    if library is not None:
+        library.mallopt(_ARENA_MAX, 1)
 
 
 def give_back() -> None:

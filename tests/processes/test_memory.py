@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import platform
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -27,3 +29,35 @@ def test_what_was_freed_between_what_is_used_goes_back():
     assert before - resident_mb() > 0.25 * 4_000 * 0.064
     assert all(bool((piece == 1).all()) for piece in kept)
     give_back()
+
+
+_HEAPS = """
+import ctypes, sys, threading
+from crowdmap_torch.processes.memory import keep_in_one_place
+if "together" in sys.argv:
+    keep_in_one_place()
+c = ctypes.CDLL(None)
+c.malloc.restype = c.fopen.restype = ctypes.c_void_p
+together = threading.Barrier(4)
+def take():
+    together.wait()
+    c.malloc(100)
+    together.wait()
+threads = [threading.Thread(target=take) for _ in range(4)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+told = c.fopen(sys.argv[1].encode(), b"w")
+c.malloc_info(0, ctypes.c_void_p(told))
+c.fclose(ctypes.c_void_p(told))
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to")
+def test_threads_share_a_heap_where_they_are_told_to(tmp_path):
+    def heaps(*told: str) -> int:
+        told_of = tmp_path / "heaps.xml"
+        subprocess.run([sys.executable, "-c", _HEAPS, str(told_of), *told], check=True)
+        return told_of.read_text().count("<heap nr=")
+
+    assert heaps() > 1
+    assert heaps("together") == 1
