@@ -248,10 +248,11 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     if not bool(state.accepted.all()):
         return state, state.done
     evidence = bundle.evidence() or pose_evidence(bundle.prior, normal, bundle.prior_scale)
+    of_border = normal.border_information() if bundle.fleet.kinds else None
     # The next ones may need memory of their own.
     del normal
     bundle.fold(dict(state.values))
-    at_rest = bundle.refresh(evidence)
+    at_rest = bundle.refresh(evidence, of_border)
     if at_rest and (state.done or int(bundle.judged) == 0):
         at_rest = not bundle.judge(backend)
     if state.done and at_rest:

@@ -11,12 +11,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from crowdmap_torch.adjustment.calibration import ByOptics
+from crowdmap_torch.adjustment.calibration_scales import rescaled as rescaled_calibrations
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.landmark_terms import size_class_term, slide_term
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, follow
 from crowdmap_torch.adjustment.lane_terms import lane_point_terms
 from crowdmap_torch.adjustment.lenses import rows_by_lens
-from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
+from crowdmap_torch.adjustment.parts import VARIABLES, Observations, Priors, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
 from crowdmap_torch.adjustment.relinearisation import Relinearised, relinearised_at
 from crowdmap_torch.adjustment.shared_corner_errors import (
@@ -24,24 +25,16 @@ from crowdmap_torch.adjustment.shared_corner_errors import (
     lasting_variance,
     shared_errors,
 )
-from crowdmap_torch.geometry import se3, spline_basis
+from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, white_scales
 from crowdmap_torch.noise.pose_prior import CUT_TERMS
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
-from crowdmap_torch.optim.problem import (
-    CostTerm,
-    Problem,
-    Variable,
-    euclidean,
-    positive,
-    pull_euclidean,
-    pull_positive,
-)
+from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, pull_euclidean
 from crowdmap_torch.optim.robust import JointTukey, Tukey
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
-from crowdmap_torch.optim.solvers.normal_equations import MapBackend
+from crowdmap_torch.optim.solvers.normal_equations import BorderInformation, MapBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.residuals import reprojection
 from crowdmap_torch.tables import to_device
@@ -55,28 +48,17 @@ _MOST_JUDGEMENTS = 2
 _NARROWS = 0.97
 """A scale of pixels that would not fall below this share of itself is at rest, and stays as it is."""
 _SCALE_STAYS = 0.005
-"""A scale of the prior that would change by less than this share stays as it is."""
+"""A scale of the prior that would change by less than this share stays as it is: the cost is to fall from step to step."""
 _SCALE_RESTS = 0.05
 """Scales of the prior of which none would change by more than this share are at rest: they are not known any better."""
+_CALIBRATION_RESTS = 0.2
+"""Likewise of calibrations, which rest on few numbers: a fifth of a prior's sigma moves a map by nothing that shows."""
 _TOLD_HOLDS = 0.02
 """What observations tell of poses' errors is found anew where any scale has changed by more than this share since."""
 _WHITE_RESTS = 0.03
 """A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
 _LASTING_RESTS = 0.1
 """The variance of a detection's shift that would change by less than this share is at rest."""
-
-
-VARIABLES = {
-    "pose": Variable(6, se3.retract, pull=se3.pull),
-    "drift": Variable(6, euclidean, pull=pull_euclidean),
-    "cut": Variable(6, euclidean, pull=pull_euclidean),
-    "bias": Variable(6, euclidean, pull=pull_euclidean),
-    "sign": Variable(6, se3.retract, pull=se3.pull),
-    "size": Variable(2, positive, pull=pull_positive),
-    "lane": Variable(3, euclidean, pull=pull_euclidean),
-}
-"""The unknowns: camera poses, their slow errors, at stretches of road and where long drives are cut, and each journey's
-constant one; signs, their sides, lanes' coefficients."""
 
 
 class Bundle(nn.Module):
@@ -107,6 +89,8 @@ class Bundle(nn.Module):
     """By journey, how far bias, drift, rotation and the bias's wander, if any, are from the sigmas of `prior`."""
     white_scale: Tensor
     """By journey, how far the noise of positions and of rotations from frame to frame is from that of `prior`."""
+    calibration_scale: Tensor
+    """By kind of what cars may have wrong, how far they are from the sigmas of `fleet`."""
     drift_told: Tensor
     """By journey and number of a pose, the share of the drift's changes that observations tell."""
     poses_left: Tensor
@@ -119,7 +103,7 @@ class Bundle(nn.Module):
     ) -> None:
         super().__init__()
         values, corners = unknowns.values, observations.corners
-        self.fleet = priors.fleet
+        self.fleet, self.config = priors.fleet, config
         own = {
             name: Variable(values[name].shape[1], euclidean, pull=pull_euclidean)
             for name in self.fleet.start
@@ -144,16 +128,16 @@ class Bundle(nn.Module):
             "prior_scale", values["bias"].new_ones(len(values["bias"]), priors.poses.scale_count)
         )
         self.register_buffer("white_scale", torch.ones_like(values["bias"][:, :2]))
+        self.register_buffer("calibration_scale", self.scale.new_ones(len(self.fleet.kinds)))
         self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
         self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
         self.register_buffer("told_at", torch.full_like(self._scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
-        self.corners, self.lane_points = corners, observations.lane_points
-        self.lenses = observations.lenses
+        points, self.lenses = observations.lane_points, observations.lenses
+        self.corners, self.lane_points = corners, points
         self._corners_by_lens = rows_by_lens(self.corners, self.lenses)
         self._lane_points_by_lens = rows_by_lens(self.lane_points, self.lenses)
         self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
-        self.config = config
         # Where each lane point was followed to is part of the state: matching starts from there.
         matches = observations.matches
         self._match_lane, self._match_begun = matches.lane, matches.t
@@ -188,10 +172,9 @@ class Bundle(nn.Module):
             joints="cut",
             joint=prior.joint,
         )
-        values = self.values()
         problem = Problem(self.variables, {**seen, **self._slide_term()})
         lane, _ = spline_basis.rows(self.lane_count)
-        return planned_ahead(problem, values, plan, sliding={"lane": lane})
+        return planned_ahead(problem, self.values(), plan, sliding={"lane": lane})
 
     @property
     def matches(self) -> LaneMatches:
@@ -238,13 +221,15 @@ class Bundle(nn.Module):
         return self._backend
 
     @torch.no_grad()
-    def refresh(self, evidence: PoseEvidence | None = None) -> bool:
+    def refresh(
+        self, evidence: PoseEvidence | None = None, of_border: BorderInformation | None = None
+    ) -> bool:
         """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
 
         The scales of pixels start at what the residuals show, so that a wrong start does not make outliers of
         everything, and fall as the fit improves; they never grow again. What detections of a sign have wrong together is
         told from zero on once they are at rest: before that it is the drift. Those of the poses' prior follow the drift and
-        the noise about it, as far as there is `evidence` of them.
+        the noise about it, as far as there is `evidence` of them, those of calibrations what `of_border` tells of cars.
         """
         values, made_with = self.values(), self._scales()
         if len(self.lane_points):
@@ -252,22 +237,26 @@ class Bundle(nn.Module):
             splines = values["lane"], self.lane_count
             begun = self._match_begun
             found = follow(self.matches, self.lane_points, pose, *splines, begun=begun)
-            self.match_t, self.match_normal = found.t, found.normal_px
-            self.match_valid = found.valid
+            self.match_t, self.match_normal, self.match_valid = (
+                found.t,
+                found.normal_px,
+                found.valid,
+            )
         self.relinearise()
         at_rest = self._narrow(values)
         if evidence is not None:
+            new = made_with, evidence.told, evidence.left
             if evidence.told is not self.drift_told:
-                self.told_at.copy_(made_with)
-                self.drift_told.copy_(evidence.told)
-                self.poses_left.copy_(evidence.left)
+                for name, found in zip(("told_at", "drift_told", "poses_left"), new, strict=True):
+                    getattr(self, name).copy_(found)
             at_rest &= self._rescale_noise(values, evidence)
-        rescaled = self.prior.rescaled(values["drift"], self.prior_scale, self.drift_told)
-        moved = (rescaled / self.prior_scale).log().abs()
-        # To the last digit: the cost is to fall from step to step.
-        self.prior_scale.copy_(torch.where(moved > _SCALE_STAYS, rescaled, self.prior_scale))
+        if of_border is not None:
+            found = rescaled_calibrations(self.fleet, values, of_border, self.calibration_scale)
+            at_rest &= self._follow("calibration_scale", found, _SCALE_STAYS, _CALIBRATION_RESTS)
+        found = self.prior.rescaled(values["drift"], self.prior_scale, self.drift_told)
+        at_rest &= self._follow("prior_scale", found, _SCALE_STAYS, _SCALE_RESTS)
         self.refreshed.fill_(True)
-        return at_rest and not bool((moved > _SCALE_RESTS).any())
+        return at_rest
 
     def evidence(self) -> PoseEvidence | None:
         """What was found last, as long as the scales are what it was found by; None: it is to be found anew."""
@@ -282,16 +271,18 @@ class Bundle(nn.Module):
 
     def _rescale_noise(self, values: dict[str, Tensor], evidence: PoseEvidence) -> bool:
         """Finds the noise of poses from frame to frame; returns whether it has come to rest."""
-        terms = self.prior.terms(self.prior_scale, self.white_scale)
-        residual = whitened_residuals(
-            self.fleet.of_poses(terms["pose_white"], self._by_mount), values
-        )
-        found = white_scales(
-            self.prior, residual, evidence.left, self.prior_scale, self.white_scale
-        )
-        moved = (found / self.white_scale).log().abs() > _WHITE_RESTS
-        self.white_scale.copy_(torch.where(moved, found, self.white_scale))
-        return not bool(moved.any())
+        scales = self.prior_scale, self.white_scale
+        term = self.fleet.of_poses(self.prior.terms(*scales)["pose_white"], self._by_mount)
+        residual = whitened_residuals(term, values)
+        found = white_scales(self.prior, residual, evidence.left, *scales)
+        return self._follow("white_scale", found, _WHITE_RESTS, _WHITE_RESTS)
+
+    def _follow(self, name: str, found: Tensor, stays: float, rests: float) -> bool:
+        """Puts scales where they are `found`, to the last digit that counts; returns whether they are at rest."""
+        scale = getattr(self, name)
+        moved = (found / scale).log().abs()
+        scale.copy_(torch.where(moved > stays, found, scale))
+        return not bool((moved > rests).any())
 
     @torch.no_grad()
     def relinearise(self) -> None:
@@ -388,11 +379,8 @@ class Bundle(nn.Module):
     def _terms(self, prior_scale: Float[Tensor, "j _"]) -> dict[str, CostTerm]:
         if not bool(self.refreshed):
             self.refresh()
-        terms = {
-            **self.prior.terms(prior_scale, self.white_scale),
-            **self.fleet.priors(),
-            **self.fixed,
-        }
+        terms = self.prior.terms(prior_scale, self.white_scale) | self.fixed
+        terms |= self.fleet.priors(self.calibration_scale)
         terms["pose_white"] = self.fleet.of_poses(terms["pose_white"], self._by_mount)
         terms.update(size_class_term(self.values()["size"], self.config))
         terms.update(self._corner_term(self.corner_sigma()))

@@ -51,7 +51,7 @@ _LEAST_APART = 1e-6
 
 @dataclass(frozen=True)
 class CalibrationConfig(Settings):
-    """How far cars may be from their rig.yaml, 1-sigma; what has 0 is known."""
+    """How far cars may be from their rig.yaml, 1-sigma, or less where the fleet shows so; what has 0 is known."""
 
     mount_deg: Degrees = 0.2
     """Turn of the camera about each of its axes against the stated mount."""
@@ -143,6 +143,17 @@ def width(variable: str, config: CalibrationConfig) -> int:
 
 
 @dataclass(frozen=True)
+class Kind:
+    """Numbers of every car whose prior sigmas have scales in common."""
+
+    variable: str
+    at: slice
+    """Where in the variable they are."""
+    alike: bool
+    """Whether cars have some of it in common: then the scale is that of what they differ in alone."""
+
+
+@dataclass(frozen=True)
 class ByOptics:
     """Derivatives of rows by the optics of their cars, in units of the configuration's sigmas."""
 
@@ -195,16 +206,22 @@ class Fleet:
         """By variable of `start` the block that drives have."""
         return {name: journey if name == _LOAD else self.of_journey[journey] for name in self.start}
 
-    def priors(self) -> dict[str, CostTerm]:
-        """Calibrations are about as stated, or as found before, and about as those of the other cars; loads are about 0."""
+    def priors(self, scale: Float[Tensor, " kinds"]) -> dict[str, CostTerm]:
+        """Calibrations are about as stated, or as found before, and about as those of the other cars; loads are about 0.
+
+        By `scale` (`calibration_scales`) the sigmas of each of `kinds` are multiplied, of what cars have partly in common
+        those of what they differ in; what was found before keeps its own.
+        """
         every = torch.arange(len(self.vehicles), device=self.velocity.device)
         count = len(self.vehicles)
         first, second = torch.triu_indices(count, count, 1, device=every.device)
-        terms = {}
+        terms, wider = {}, self._scales(scale)
         for name in self.variables:
             together = ~self.found_before[name] & alike(name, self.config).to(every.device)
-            alone, apart = _of_cars(together.sum(0).to(self.velocity), self.config.in_common)
-            sigma = torch.where(together, alone, self.prior_sigma[name])
+            in_common = self.config.in_common
+            alone, apart = _of_cars(together.sum(0).to(self.velocity), in_common, wider[name])
+            own = self.prior_sigma[name] * torch.where(self.found_before[name], 1.0, wider[name])
+            sigma = torch.where(together, alone, own)
             terms[f"{name}_prior"] = CostTerm(
                 gauss_markov_start,
                 ((name, every),),
@@ -219,9 +236,9 @@ class Fleet:
                     weight=apart * (together[first] & together[second]),
                     takes_rows=True,
                 )
-        if _LOAD in self.start:
-            load = self.start[_LOAD]
-            drives = torch.arange(len(load), device=load.device)
+        if self.config.load_m:
+            drives = torch.arange(len(self.of_journey), device=every.device)
+            load = self.velocity.new_zeros(len(drives), 1)
             terms[f"{_LOAD}_prior"] = CostTerm(
                 gauss_markov_start,
                 ((_LOAD, drives),),
@@ -230,6 +247,26 @@ class Fleet:
                 takes_rows=True,
             )
         return terms
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """What has scales of its own: every parameter. All drives have loads: those count as configured."""
+        return tuple(
+            Kind(variable, at, bool(alike(variable, self.config)[at.start]))
+            for variable in self.variables
+            for at in columns(variable, self.config).values()
+        )
+
+    def new(self, kind: Kind) -> Int[Tensor, " n"]:
+        """The cars of which nothing of that kind was found before."""
+        return torch.nonzero(~self.found_before[kind.variable][:, kind.at.start])[:, 0]
+
+    def _scales(self, scale: Float[Tensor, " kinds"]) -> dict[str, Float[Tensor, " k"]]:
+        """By variable the scales of every number of a car."""
+        wide: dict[str, list[Tensor]] = {}
+        for kind, own in zip(self.kinds, scale, strict=True):
+            wide.setdefault(kind.variable, []).append(own.expand(kind.at.stop - kind.at.start))
+        return {variable: torch.cat(parts) for variable, parts in wide.items()}
 
     def of_poses(self, term: CostTerm, by: Float[Tensor, "p 6 k"]) -> CostTerm:
         """`pose_white`, of the pose that a true mount and clock would give; `by` is `by_mount` of the poses."""
@@ -385,12 +422,22 @@ def fleet_of(
 
 
 def _of_cars(
-    count: Float[Tensor, " k"], in_common: float
+    count: Float[Tensor, " k"], in_common: float, scale: Float[Tensor, " k"]
 ) -> tuple[Float[Tensor, " k"], Float[Tensor, " k"]]:
-    """1-sigma of each car's row and weight of each pair's, by number, where so many cars have something in common."""
+    """1-sigma of each car's row and weight of each pair's, by number, where so many cars have something in common.
+
+    `scale` is that of what cars differ in.
+    """
+    apart, alone = variances(count, in_common)
+    apart = apart * scale.square()
+    between = (1 / apart - 1 / alone).clamp_min(0) / count.clamp_min(1)
+    return alone.sqrt(), between.sqrt()
+
+
+def variances(count: Float[Tensor, "*k"], in_common: float) -> tuple[float, Float[Tensor, "*k"]]:
+    """Of `count` cars' numbers, each of which has a variance of 1: of what they differ in, and of sum / sqrt(count)."""
     apart = max(1 - in_common, _LEAST_APART)
-    alone = apart + count * in_common
-    return alone.sqrt(), ((1 / apart - 1 / alone) / count.clamp_min(1)).sqrt()
+    return apart, apart + count * in_common
 
 
 def _means(value: Float[Tensor, "m 2"], group: Int[Tensor, " m"]) -> Float[Tensor, "m 2"]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment import calibration
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration_scales import prior_sigmas
 from crowdmap_torch.optim.solvers.normal_equations import MapCovariance
 
 UNSEEN = 0.7
@@ -28,6 +29,7 @@ class CarCalibration:
     """The truth minus what rig.yaml says, most likely."""
     sigma: dict[str, tuple[float, ...]]
     prior_sigma: dict[str, tuple[float, ...]]
+    """The configuration's, by as much wider or narrower as the fleet shows, or that which it was found with before."""
     unseen: tuple[str, ...]
     """Numbers that are as unsure as before."""
     confounded: tuple[tuple[str, str, float], ...]
@@ -58,7 +60,8 @@ def found_calibration(bundle: Bundle, covariance: MapCovariance) -> FleetCalibra
             unit += [getattr(fleet.config, name)] * count
             labels += [f"{name}{axis}" for axis in _AXES[count]]
     scale = value.new_tensor(unit)
-    prior = torch.cat([fleet.prior_sigma[name] for name in fleet.variables], dim=1)
+    before = prior_sigmas(fleet, bundle.calibration_scale)
+    prior = torch.cat([before[name] for name in fleet.variables], dim=1)
     sigma = joint.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     found = {}
     for car, name in enumerate(fleet.vehicles):

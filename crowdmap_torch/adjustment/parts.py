@@ -10,9 +10,29 @@ from torch import Tensor
 from crowdmap_torch.adjustment.calibration import Fleet
 from crowdmap_torch.adjustment.lane_matching import LaneMatches
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
+from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.noise.pose_prior import PosePrior
-from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.optim.problem import (
+    CostTerm,
+    Variable,
+    euclidean,
+    positive,
+    pull_euclidean,
+    pull_positive,
+)
+
+VARIABLES = {
+    "pose": Variable(6, se3.retract, pull=se3.pull),
+    "drift": Variable(6, euclidean, pull=pull_euclidean),
+    "cut": Variable(6, euclidean, pull=pull_euclidean),
+    "bias": Variable(6, euclidean, pull=pull_euclidean),
+    "sign": Variable(6, se3.retract, pull=se3.pull),
+    "size": Variable(2, positive, pull=pull_positive),
+    "lane": Variable(3, euclidean, pull=pull_euclidean),
+}
+"""The unknowns: camera poses, their slow errors, at stretches of road and where long drives are cut, and each journey's
+constant one; signs, their sides, lanes' coefficients."""
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,11 @@ def fleet_of_cars(
 
 def covariance_before(fleet: Fleet, variable: str) -> Tensor:
     """Of all cars' numbers [v, k, v, k], by the rows that are known of them before anything is seen."""
-    terms = [term for name, term in fleet.priors().items() if name.startswith(variable)]
+    terms = [
+        term
+        for name, term in fleet.priors(torch.ones(len(fleet.kinds), dtype=F64)).items()
+        if name.startswith(variable)
+    ]
 
     def cost(x: Tensor) -> Tensor:
         return torch.stack([residuals(t, {variable: x}).square().sum() / 2 for t in terms]).sum()
@@ -249,7 +253,8 @@ def test_a_cars_height_is_as_unsure_as_its_loads(found: FleetCalibration) -> Non
     three_drives = CalibrationConfig().load_m / 3**0.5
     for car in found.values():
         (sigma,) = car.sigma["height_m"]
-        assert three_drives < sigma < 2 * three_drives
+        # What is known of cars' heights takes a few hundredths off.
+        assert 0.9 * three_drives < sigma < 2 * three_drives
 
 
 def test_what_cannot_be_seen_is_named(found: FleetCalibration) -> None:

@@ -46,6 +46,7 @@ from crowdmap_torch.optim.solvers.landmark_covariance import LandmarkCovariance
 from crowdmap_torch.optim.solvers.layout import SparsityPattern
 from crowdmap_torch.optim.solvers.normal_equations import (
     DIAGONAL_FLOOR,
+    BorderInformation,
     ChainChanges,
     Step,
     StepPart,
@@ -167,6 +168,8 @@ class Factor:
     """The gradient a of the equations that they are of."""
     is_undamped: bool
     """Whether next to nothing was added to the diagonals."""
+    added: Float[Tensor, " r"]
+    """What was added to that of C."""
 
 
 @dataclass(frozen=True)
@@ -253,6 +256,18 @@ class ChainNormalEquations:
         """Variances of the changes between blocks of chains: leaves marginalised, landmarks and border known."""
         return self.known.of_changes(changes)
 
+    def border_information(self) -> BorderInformation:
+        """Information on the border, everything else marginalised, as the last step had it."""
+        where, begin = self.structure.where, self.structure.border_begin
+        factor = self.workspace.factor
+        assert factor is not None, "solved first"
+        upper = factor.reduced.trailing(begin)
+        matrix = upper.mT @ upper - torch.diag(factor.added[begin:])
+        entries = {
+            name: where.entries(name, slice(None)) - begin for name in self.structure.plan.border
+        }
+        return BorderInformation(matrix, entries)
+
     @cached_property
     def known(self) -> KnownLandmarks:
         """Covariances of eliminated blocks, the landmarks known; by what the last solve left behind if that is as good."""
@@ -284,7 +299,9 @@ class ChainNormalEquations:
         is_undamped = not bool(
             (added_x > _NEXT_TO_NOTHING * self.diagonal.diagonal(dim1=-2, dim2=-1)).any()
         )
-        self.workspace.factor = Factor(leads, reduced, self.eliminated_gradient, is_undamped)
+        self.workspace.factor = Factor(
+            leads, reduced, self.eliminated_gradient, is_undamped, added_y
+        )
         return system.right_side
 
     def _eliminate(

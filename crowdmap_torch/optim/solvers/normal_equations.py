@@ -197,6 +197,26 @@ class NormalEquations(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class BorderInformation:
+    """Information on all that drives have to themselves or share, priors included, everything else marginalised."""
+
+    matrix: Float[Tensor, "z z"]
+    entries: Mapping[str, Int[Tensor, "n k"]]
+    """By variable, where in the matrix the tangent of each block is."""
+
+    def on(self, *names: str) -> Float[Tensor, "m m"]:
+        """That on all numbers of some variables, one behind the other, the others marginalised too."""
+        own = torch.cat([self.entries[name].flatten() for name in names])
+        others = torch.ones(len(self.matrix), dtype=torch.bool, device=own.device)
+        others[own] = False
+        others = torch.nonzero(others)[:, 0]
+        across = self.matrix[others[:, None], own]
+        factor, failed = torch.linalg.cholesky_ex(self.matrix[others[:, None], others])
+        assert not bool(failed), "the border of a step that was solved is positive definite"
+        return self.matrix[own[:, None], own] - across.mT @ torch.cholesky_solve(across, factor)
+
+
 @runtime_checkable
 class Correctable(NormalEquations, Protocol):
     """Those of one problem whose last factors serve other gradients too."""
@@ -229,6 +249,10 @@ class MapEquations(NormalEquations, Protocol):
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
         """Variance of each leaf's numbers less those of the block that carries it, landmarks and border known."""
+        ...
+
+    def border_information(self) -> BorderInformation:
+        """Information on what drives have to themselves or share, as the last step had it."""
         ...
 
 

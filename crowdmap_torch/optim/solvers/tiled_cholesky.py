@@ -81,6 +81,17 @@ class TiledCholesky:
                 self._forward(x, k, right)
         return x.flatten(0, 1)
 
+    def trailing(self, begin: int) -> Float[Tensor, "z z"]:
+        """U from this row and column on: its square is what is left of the matrix there once all before are eliminated."""
+        pattern, tiles = self.upper.pattern, self.upper.tiles
+        first, w = begin // pattern.width, pattern.width
+        whole = tiles.new_zeros(pattern.tiles - first, w, pattern.tiles - first, w)
+        for i, right in enumerate(pattern.columns[first:]):
+            for j in (first + i, *right):
+                whole[i, :, j - first] = tiles[pattern.number[first + i][j]]
+        here = slice(begin - first * w, pattern.dim - first * w)
+        return whole.flatten(2, 3).flatten(0, 1)[here, here].triu()
+
     def _begun(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "t w c"]:
         """Right-hand sides by rows of tiles."""
         pattern = self.upper.pattern

@@ -116,6 +116,18 @@ def test_covariances_are_blocks_of_the_dense_inverse(world):
         torch.testing.assert_close(found.of_border_mean(name), every, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
+@pytest.mark.parametrize("marks", [7, 400])
+def test_information_on_the_border_is_the_inverse_of_its_covariance(marks, world):
+    problem, values, plan = world(marks=marks)
+    dense, normal = (b.assemble(problem, values) for b in (DenseBackend(), ChainBackend(plan)))
+    normal.solve(torch.tensor([1e-12], dtype=torch.float64))
+    at = torch.cat([rows_of(dense, name) for name in plan.border])
+    expected = torch.linalg.inv(torch.linalg.inv(dense.hessian[0])[at[:, None], at])
+    found = normal.border_information().on(*plan.border)
+    torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
+
+
 def test_a_covariance_whose_factors_are_gone_is_refused():
     problem, values, plan = drives()
     normal = ChainBackend(plan).assemble(problem, values)
