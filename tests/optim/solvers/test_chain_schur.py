@@ -126,7 +126,8 @@ def test_elimination_gives_the_dense_step(lengths, group_size, batch_bytes, part
 def test_the_last_factors_serve_another_gradient(lengths, parts):
     built, values, chain = problem(lengths)
     plan = in_parts(EliminationPlan("pose", chain), parts)
-    ours, dense = (b.assemble(built, values) for b in (ChainBackend(plan), DenseBackend()))
+    ours = ChainBackend(plan).assemble(built, values)
+    dense = DenseBackend().assemble(built, values)
     damping = torch.tensor([1e-3], dtype=torch.float64)
     step = ours.solve(damping)
     for name, own in ours.correct(ours.tangent_gradient).items():
