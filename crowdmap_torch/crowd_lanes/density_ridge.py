@@ -26,8 +26,8 @@ from crowdmap_torch.crowd_lanes.line_samples import (
 from crowdmap_torch.processes.threads import in_order
 from crowdmap_torch.tables import Rows, concatenate
 
-_PAIRS_AT_ONCE = 500_000
-"""Pairs of points and samples, about, that are held at once: they are what memory goes to."""
+_PAIRS_AT_ONCE = 100_000
+"""Pairs of points and samples, about, that are held at once by a thread: they are what memory goes to."""
 _SECTOR = torch.pi / 12
 """Grain of the directions of start points."""
 

@@ -30,12 +30,10 @@ from crowdmap_torch.processes.threads import in_order
 class Through:
     """What right-hand sides of a part's blocks are to what stays, by way of A^-1."""
 
-    x: Float[Tensor, "n k c"]
-    """A^-1 of them."""
     row: Int[Tensor, " r"]
     """Columns of the reduced system of the landmarks that the part is coupled to."""
     by_landmark: Float[Tensor, "r columns c"]
-    """B x, those of one column added up."""
+    """B x, those of one column added up, where x is A^-1 of them."""
     chain: Int[Tensor, " h"]
     """The part's chains."""
     by_chain: Float[Tensor, "h b c"]
@@ -98,7 +96,7 @@ class ChainBorder:
         column: Int[Tensor, " n"],
         columns: int,
     ) -> Through:
-        """A^-1 of right-hand sides of a part's blocks, and what it is to what stays.
+        """What A^-1 of right-hand sides of a part's blocks is to what stays.
 
         `column` is that of each block in the landmarks' sums; the products with what stands `beside` are summed up as well.
         """
@@ -110,7 +108,7 @@ class ChainBorder:
         by_chain.index_add_(0, of, self.link[part.block].mT @ x)
         own = x.new_zeros(len(chain), x.shape[-1], beside.shape[-1])
         own.index_add_(0, of, x.mT @ beside)
-        return Through(x, row, by_landmark, chain, by_chain, own)
+        return Through(row, by_landmark, chain, by_chain, own)
 
     def _couple(
         self, part: Part, x: Float[Tensor, "n k c"], column: Int[Tensor, " n"], columns: int
