@@ -124,7 +124,8 @@ def scale_of(
     told = (1 / left - scale**-2).clamp_min(_LEAST_TOLD)
     mean = (axes.mT @ value / left).square()
     least, most, count = _SCALES
-    s = torch.linspace(math.log(least), math.log(most), count).to(value).exp()
+    like = {"dtype": value.dtype, "device": value.device}
+    s = torch.linspace(math.log(least), math.log(most), count, **like).exp()
     square = s.square()[:, None]
     gain = 1 + told * square
     evidence = (mean * square / gain - gain.log()).sum(1) / 2 - s.square() / 2
@@ -132,9 +133,11 @@ def scale_of(
     weight = torch.softmax(evidence + s.log(), 0)
     determined = (told * square / gain).sum(1)
     wanted = (weight * determined).sum()
-    behind = torch.searchsorted(determined, wanted).clamp(1, count - 1)
-    share = (wanted - determined[behind - 1]) / (determined[behind] - determined[behind - 1])
-    return s[behind - 1] * (s[behind] / s[behind - 1]) ** share
+    behind = torch.searchsorted(determined, wanted[None]).clamp(1, count - 1)
+    around = torch.cat((behind - 1, behind))
+    below, above = determined[around].unbind(0)
+    low, high = s[around].unbind(0)
+    return low * (high / low) ** ((wanted - below) / (above - below))
 
 
 def _differences(fleet: Fleet, values: Mapping[str, Tensor]) -> list[Differences]:
@@ -150,7 +153,8 @@ def _differences(fleet: Fleet, values: Mapping[str, Tensor]) -> list[Differences
             continue
         column = torch.arange(kind.at.start, kind.at.stop, device=new.device)
         row = offset[kind.variable] + new[:, None] * wide + column
-        eye = torch.eye(len(new)).to(values[kind.variable])
+        like = values[kind.variable]
+        eye = torch.eye(len(new), dtype=like.dtype, device=like.device)
         # Whatever is at right angles to the mean.
         basis = torch.linalg.qr(torch.cat((torch.ones_like(eye[:, :1]), eye[:, 1:]), dim=1)).Q
         basis, variance, of_prior = basis[:, 1:], 1.0, eye
