@@ -91,6 +91,8 @@ class ChainBackend:
         The workspace of the solve is the back end's: of its normal equations only the last may be solved.
         """
         structure, workspace = self.prepare(problem, values)
+        # The last ones go before the next ones come.
+        workspace.factor = None
         coupling = {
             name: workspace.coupling(
                 name, (*coupling.column.shape, structure.width[coupling.variable])
