@@ -133,8 +133,8 @@ class Bundle(nn.Module):
         self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
         self.register_buffer("told_at", torch.full_like(self._scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
-        points, self.lenses = observations.lane_points, observations.lenses
-        self.corners, self.lane_points = corners, points
+        self.corners, self.lane_points = corners, observations.lane_points
+        self.lenses = observations.lenses
         self._corners_by_lens = rows_by_lens(self.corners, self.lenses)
         self._lane_points_by_lens = rows_by_lens(self.lane_points, self.lenses)
         self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
@@ -237,18 +237,15 @@ class Bundle(nn.Module):
             splines = values["lane"], self.lane_count
             begun = self._match_begun
             found = follow(self.matches, self.lane_points, pose, *splines, begun=begun)
-            self.match_t, self.match_normal, self.match_valid = (
-                found.t,
-                found.normal_px,
-                found.valid,
-            )
+            self.match_t, self.match_normal = found.t, found.normal_px
+            self.match_valid = found.valid
         self.relinearise()
         at_rest = self._narrow(values)
         if evidence is not None:
-            new = made_with, evidence.told, evidence.left
             if evidence.told is not self.drift_told:
-                for name, found in zip(("told_at", "drift_told", "poses_left"), new, strict=True):
-                    getattr(self, name).copy_(found)
+                self.told_at.copy_(made_with)
+                self.drift_told.copy_(evidence.told)
+                self.poses_left.copy_(evidence.left)
             at_rest &= self._rescale_noise(values, evidence)
         if of_border is not None:
             found = rescaled_calibrations(self.fleet, values, of_border, self.calibration_scale)

@@ -7,6 +7,8 @@ from dataclasses import replace
 import torch
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
+from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 
 KEEP = 0.9
@@ -140,3 +142,17 @@ def rows_of(dense, name):
     """Rows of a variable's tangents in the dense system."""
     at = dense.where.offset[name][:, None]
     return (at + torch.arange(dense.where.tangent_dim[name])).flatten()
+
+
+def assert_the_last_factors_serve_another_gradient(problem, values, plan):
+    """The step of the gradient itself is that of the solve, and that of any other one the dense one."""
+    ours = ChainBackend(plan).assemble(problem, values)
+    dense = DenseBackend().assemble(problem, values)
+    damping = torch.tensor([1e-3], dtype=torch.float64)
+    step = ours.solve(damping)
+    for name, own in ours.correct(ours.tangent_gradient).items():
+        torch.testing.assert_close(own, step.delta[name], rtol=1e-9, atol=1e-12)
+    other = {name: torch.cos(3 * x + 1) for name, x in ours.tangent_gradient.items()}
+    asked = replace(dense, gradient=dense.where.pack(other)).solve(damping).delta
+    for name, own in ours.correct(other).items():
+        torch.testing.assert_close(own, asked[name], rtol=1e-8, atol=1e-10)

@@ -130,7 +130,7 @@ class ChainBorder:
 
 
 @dataclass(frozen=True)
-class ChainSums:
+class WeightedSums:
     """Weighted sums over chains' blocks as functions of what stays, entry by entry."""
 
     row: Int[Tensor, " n"]
@@ -147,9 +147,9 @@ class ChainSums:
         return total.index_add_(0, at, self.value[here]).view(dim, end - begin, -1)
 
 
-def chain_sums(
+def weighted_sums(
     chains: ChainBorder, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
-) -> tuple[Float[Tensor, "j m m"], ChainSums]:
+) -> tuple[Float[Tensor, "j m m"], WeightedSums]:
     """Covariance of weighted sums over chains' blocks, what stays known, and how they go with what stays.
 
     Leaves are left out; `of` says of which of the sums each chain is.
@@ -178,7 +178,7 @@ def chain_sums(
             of_sum.append(columns.flatten())
             value.append(of_each.flatten(0, 1))
     none = torch.zeros(0, dtype=torch.long, device=weight.device)
-    return own, ChainSums(
+    return own, WeightedSums(
         torch.cat([none, *row]),
         torch.cat([none, *of_sum]),
         torch.cat([weight.new_zeros(0, m), *value]),

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.border import ChainBorder, chain_sums
+from crowdmap_torch.optim.solvers.border import ChainBorder, weighted_sums
 from crowdmap_torch.optim.solvers.layout import Layout, read_entries
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
@@ -63,7 +63,7 @@ class LandmarkCovariance:
         ValueError where the factors are there no more.
         """
         self._check()
-        found, sums = chain_sums(self._chains, weight, of, count)
+        found, sums = weighted_sums(self._chains, weight, of, count)
         m = weight.shape[-1]
         each = max(_COLUMNS // m, 1)
         for begin in range(0, count, each):
