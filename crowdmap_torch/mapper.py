@@ -156,10 +156,11 @@ def build_map(
     first = first_map(journeys, maps, config)
     bundle = build_bundle(journeys, maps, first, config, control=control)
     state = begun = adjust.start(bundle)
-    for iteration, after in adjust.steps(bundle, begun):
-        state = after
-        progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
-    return finish_map(dataset, maps, first, bundle, state, config)
+    with engine_of(None, workers=workers) as engine:
+        for iteration, after in adjust.steps(bundle, begun, engine=engine):
+            state = after
+            progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
+        return finish_map(dataset, maps, first, bundle, state, config, engine)
 
 
 def map_journeys(
@@ -346,11 +347,15 @@ def finish_map(
     bundle: Bundle,
     state: LmState,
     config: MapperConfig,
+    engine: Engine | None = None,
 ) -> MapResult:
-    """The adjusted map with its covariances, the refined poses, and which landmark each detection shows."""
+    """The adjusted map with its covariances, the refined poses, and which landmark each detection shows.
+
+    Covariances of many drives are found by the hosts of an engine; None: all in this process.
+    """
     journeys = dataset.journeys
     poses = adjust.read_poses(bundle, journeys)
-    uncertainty = map_uncertainty(bundle, first.signs, first.lanes)
+    uncertainty = map_uncertainty(bundle, first.signs, first.lanes, engine)
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes, uncertainty)
     associations = first.associations
     if first.completed is not None:

@@ -9,6 +9,7 @@ all that the next ones follow from; a bundle that is built alike goes on from th
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import CalibrationConfig, fleet_of
 from crowdmap_torch.adjustment.config import AdjustConfig
+from crowdmap_torch.adjustment.convoys import Convoys
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.cuts import cut_drives
 from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes, supported_lanes
@@ -32,18 +34,17 @@ from crowdmap_torch.adjustment.observations import (
     spaced_frames,
 )
 from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
+from crowdmap_torch.adjustment.steps import adjust_step, start
 from crowdmap_torch.crowd_lanes.table import LaneSupport
+from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.calibration import KnownCalibration
-from crowdmap_torch.noise.pose_evidence import pose_evidence
 from crowdmap_torch.noise.pose_prior import MOST_NUMBERS, DriftNodes, drift_nodes, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm
-from crowdmap_torch.optim.solvers.normal_equations import MapBackend, MapEquations
 from crowdmap_torch.processes.memory import give_back
-from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.residuals.lane import lane_prior, lane_stretch
 from crowdmap_torch.residuals.sign_prior import against_the_drive, habit_term, sign_place
 from crowdmap_torch.survey.control import ControlSigns
@@ -165,28 +166,27 @@ def adjust(bundle: Bundle) -> lm.LmState:
     return state
 
 
-@one_core_each()
-@torch.no_grad()
-def start(bundle: Bundle) -> lm.LmState:
-    """The state before the first step: lanes matched, scales as wide as residuals show, the order of elimination found."""
-    bundle.fold(bundle.values())
-    bundle.refresh()
-    problem, values = bundle.problem(), bundle.values()
-    bundle.backend().prepare(problem, values)
-    give_back()
-    return lm.init(problem, values, bundle.config.lm)
+def steps(
+    bundle: Bundle, state: lm.LmState, *, first: int = 0, engine: Engine | None = None
+) -> Iterator[tuple[int, lm.LmState]]:
+    """Every step's number, from `first` on, and the state after it, until the adjustment is finished or out of steps.
 
-
-def steps(bundle: Bundle, state: lm.LmState, *, first: int = 0) -> Iterator[tuple[int, lm.LmState]]:
-    """Every step's number, from `first` on, and the state after it, until the adjustment is finished or out of steps."""
-    backend = bundle.backend()
-    for number in range(first, bundle.config.lm.max_iterations):
-        # What goes on with more to do was set running again: a state that is done was the last one.
-        if number and state.done:
-            break
-        state, _ = adjust_step(bundle, state, backend)
-        give_back()
-        yield number, state
+    Many drives are shared out to the hosts of an engine, in `convoys`; None: all of them are in this process.
+    """
+    numbers = range(first, bundle.config.lm.max_iterations)
+    with ExitStack() as ends:
+        shared = len(bundle.convoys) > 1
+        convoys = ends.enter_context(Convoys(bundle, state, engine)) if shared else None
+        for number in numbers:
+            # What goes on with more to do was set running again: a state that is done was the last one.
+            if number and state.done:
+                break
+            if convoys is None:
+                state, _ = adjust_step(bundle, state, bundle.backend())
+                give_back()
+            else:
+                state, _ = convoys.step()
+            yield number, state
 
 
 @dataclass(frozen=True)
@@ -229,35 +229,6 @@ def go_on(bundle: Bundle, standing: Standing) -> lm.LmState:
 
 def _kind(tensor: Tensor | None) -> str:
     return "missing" if tensor is None else f"{tensor.dtype} {list(tensor.shape)}"
-
-
-@one_core_each()
-@torch.no_grad()
-def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple[lm.LmState, bool]:
-    """One step of the solver, folded into the bundle, and whether the adjustment is finished.
-
-    Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
-    first come to rest, and when the solver stops. It is finished when that changes nothing.
-    """
-    problem = bundle.problem()
-    normal = state.normal
-    if not isinstance(normal, MapEquations):
-        normal = backend.assemble(problem, state.values)
-        state = replace(state, normal=normal, linearizations=state.linearizations + 1)
-    state = lm.step(problem, state, bundle.config.lm, backend=backend)
-    if not bool(state.accepted.all()):
-        return state, state.done
-    evidence = bundle.evidence() or pose_evidence(bundle.prior, normal, bundle.prior_scale)
-    of_border = normal.border_information() if bundle.fleet.kinds else None
-    # The next ones may need memory of their own.
-    del normal
-    bundle.fold(dict(state.values))
-    at_rest = bundle.refresh(evidence, of_border)
-    if at_rest and (state.done or int(bundle.judged) == 0):
-        at_rest = not bundle.judge(backend)
-    if state.done and at_rest:
-        return state, True
-    return lm.changed(state), False
 
 
 def _points_on_ground(

@@ -99,6 +99,9 @@ class AdjustConfig(Settings):
     """Drives over a larger map are cut into stretches along which signs and lanes have at most about so many unknowns, fewer
     where few drives pass, and solved for between the cuts: time and memory grow with the way driven, no faster. 0: none
     is. The map is the same."""
+    convoy_m: LengthOrNone = 50_000.0
+    """Where twice as much way was driven and more, drives are adjusted in convoys of about so much or more, wherever there
+    are workers for them; 0: all in one. The map is the same but for rounding, and with any workers to the last bit."""
 
     def __post_init__(self) -> None:
         """Refuses unknown methods and Jacobians."""

@@ -6,18 +6,22 @@ marginalised, as far as landmarks are bound to each other; what all positions sh
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.adjustment.bias_sums import bias_of_poses, sums_of_bias
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.convoys import Convoys
 from crowdmap_torch.adjustment.found_calibration import (
     FleetCalibration,
     found_calibration,
     sigma_of_mean,
 )
+from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.optim.problem import Values
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, MapCovariance
@@ -52,18 +56,27 @@ class MapUncertainty:
 
 
 @torch.no_grad()
-def map_uncertainty(bundle: Bundle, signs: Signs, lanes: Lanes) -> MapUncertainty:
-    """Covariances at the bundle's values; `signs` and `lanes` are those that it was built from."""
+def map_uncertainty(
+    bundle: Bundle, signs: Signs, lanes: Lanes, engine: Engine | None = None
+) -> MapUncertainty:
+    """Covariances at the bundle's values; `signs` and `lanes` are those that it was built from.
+
+    Of many drives they are found by the hosts of an engine, as steps are; None: all in this process.
+    """
     values = bundle.values()
     nodes = bundle.prior.nodes
     journeys = len(values["bias"])
     expected = bundle.prior.expected_scale(values["drift"], bundle.prior_scale, bundle.drift_told)
-    covariance = bundle.backend().assemble(bundle.information(expected), values).covariance()
-    to_bias = _to_bias(values["pose"][nodes.first])
-    count = torch.bincount(nodes.journey, minlength=journeys).to(to_bias)
-    of_mean = to_bias.new_zeros(len(to_bias), bundle.prior.numbers, 4)
-    of_mean[:, :6] = to_bias.mT / count[nodes.journey, None, None]
-    of_bias = covariance.of_sums(of_mean, bundle.prior.journey_of_chain, journeys)
+    with ExitStack() as ends:
+        if len(bundle.convoys) > 1:
+            convoys = ends.enter_context(Convoys(bundle, None, engine))
+            covariance, of_bias = convoys.covariance(expected)
+        else:
+            problem = bundle.information(expected)
+            covariance = bundle.backend().assemble(problem, values).covariance()
+            of_bias = covariance.of_sums(*sums_of_bias(bundle))
+    to_bias = bias_of_poses(values["pose"][nodes.first])
+    count = torch.bincount(nodes.journey, minlength=journeys)
     every = torch.arange(len(signs), device=count.device)
     sign = LinearFunctions.of_tangents((("sign", every), ("size", every)), to_bias, 6, 2)
     of_sign = covariance.of(sign)
@@ -105,15 +118,6 @@ def _shared(covariance: MapCovariance, values: Values, like: Tensor) -> Float[Te
 def _places(name: str, block: Int[Tensor, " n"], position: Float[Tensor, "3 k"]) -> LinearFunctions:
     """Where blocks of a variable are, as functions of its tangents."""
     return LinearFunctions(((name, block),), (position.expand(len(block), *position.shape),))
-
-
-def _to_bias(T_world_camera: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 6"]:
-    """What takes the error of a pose to that of its position and of its heading."""
-    matrix = T_world_camera.new_zeros(len(T_world_camera), 4, 6)
-    matrix[:, :3, :3] = torch.eye(3).to(matrix)
-    # The rotation is about the camera's axes; its part about world up is the heading.
-    matrix[:, 3, 3:] = T_world_camera[:, 2, :3]
-    return matrix
 
 
 def _corner_covariance(

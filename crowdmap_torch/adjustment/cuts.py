@@ -1,6 +1,11 @@
-"""Where long drives are cut: all of them at the same places, so that what lies within a square is bound to little else."""
+"""Where long drives are cut, and which drives are adjusted together.
+
+All are cut at the same places, so that what lies within a square is bound to little else.
+"""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float, Int
@@ -66,3 +71,21 @@ def cut_at_squares(
             at += gone
         start = stop
     return torch.tensor(found, dtype=torch.long, device=position.device)
+
+
+def convoys(
+    journey: Int[Tensor, " n"], way: Float[Tensor, " n"], journeys: int, at_least_m: float
+) -> list[tuple[int, int]]:
+    """The first drive of every convoy and the one behind its last; one convoy where the way is not worth two.
+
+    Drives are `journeys` one behind the other, with nodes of which each has the `way` driven to it. A convoy drives so
+    much or more, but for what drives are longer than others.
+    """
+    driven = way.new_zeros(journeys).scatter_reduce(0, journey, way, "amax")
+    total = float(driven.sum())
+    count = min(int(total / at_least_m), journeys) if at_least_m else 1
+    if count < 2:
+        return [(0, journeys)]
+    of = ((driven.cumsum(0) - driven / 2) / total * count).long().clamp_max(count - 1)
+    first = [0, *(torch.nonzero(of.diff())[:, 0] + 1).tolist(), journeys]
+    return list(pairwise(first))

@@ -42,8 +42,9 @@ def slide_term(
     Each control point is held, along its lane, to the pose `beside` it, at the place of the moment: so it is not pulled;
     the map's covariance is taken without it.
     """
-    index = torch.arange(len(beside), device=beside.device)
-    offset = (control_world - T_world_camera[beside, :3, 3]).detach()
+    index = torch.nonzero(beside >= 0)[:, 0]
+    beside, along = beside[index], along[index]
+    offset = (control_world[index] - T_world_camera[beside, :3, 3]).detach()
     term = CostTerm(
         lane.lane_slide,
         (("pose", beside), ("lane", index)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.calibration import Fleet
@@ -21,6 +21,8 @@ from crowdmap_torch.optim.problem import (
     pull_euclidean,
     pull_positive,
 )
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.processes.together import Together
 
 VARIABLES = {
     "pose": Variable(6, se3.retract, pull=se3.pull),
@@ -78,6 +80,19 @@ class Priors:
     fixed: dict[str, CostTerm]
     """Of signs and lanes: terms that stay as they are."""
     beside: Int[Tensor, " c"]
-    """The pose nearest to each lane coefficient at the start."""
+    """The pose nearest to each lane coefficient at the start; -1: it is another's."""
     fleet: Fleet
     """What cars have wrong for good."""
+
+
+@dataclass(frozen=True)
+class SharedOut:
+    """Some of all drives, and who has the others."""
+
+    together: Together
+    plan: EliminationPlan
+    """What is eliminated of them, and how; landmarks are ranked as in all drives' plan."""
+    own: Bool[Tensor, " j"]
+    """Which journeys they are."""
+    detections: int
+    """How many numbers detections have, everybody's."""

@@ -218,15 +218,15 @@ def _map(
             kept.keep_start(watch.start(bundle, mapper.clusters_map(dataset, first)))
         else:
             watch.go_on(found.start, found.course)
-        state, most = begun, config.adjust.lm.max_iterations
-        for iteration, state in adjust.steps(bundle, begun, first=found.steps):
+        state, by, most = begun, where.of_convoys(bundle), config.adjust.lm.max_iterations
+        for iteration, state in adjust.steps(bundle, begun, first=found.steps, engine=by):
             watch.step(iteration, state, bundle)
             kept.keep_step(adjust.standing(bundle, state, iteration + 1), watch.course)
             progress("bundle adjustment", iteration + 1, most, f"cost {float(state.cost):.1f}")
 
         # ---- the map ----
         progress("covariances and map")
-        result = mapper.finish_map(dataset, maps, first, bundle, state, config)
+        result = mapper.finish_map(dataset, maps, first, bundle, state, config, by)
         watch.finish(bundle, result.hd_map)
     # What follows is written and drawn: on the CPU, wherever it was made.
     dataset, result = to_device((dataset, result), "cpu")

@@ -11,6 +11,7 @@ from typing import TypedDict
 import torch
 
 from crowdmap_torch import mapper
+from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.engine import Engine, Spent
@@ -40,6 +41,7 @@ class Whereabouts(ExitStack):
     def __init__(self, options: argparse.Namespace) -> None:
         """ValueError if what is asked for is not there; nothing is begun."""
         super().__init__()
+        self._options = options
         self.device = _device(options.device)
         self.engine = _engine(options, self.device)
         self.at_work: Engine | None = None
@@ -99,6 +101,15 @@ class Whereabouts(ExitStack):
         is_alike = config.resolved().sign_association == config.sign_association
         tracklets = look.tracklets if is_alike and self.device.type == "cpu" else {}
         return {"engine": self.at_work, "stored": self.stored, "tracklets": tracklets}
+
+    def of_convoys(self, bundle: Bundle) -> Engine | None:
+        """An engine for the convoys of an adjustment, begun; None: there is one convoy, for this process."""
+        if len(bundle.convoys) == 1:
+            return None
+        engine = _engine(self._options, self.device)
+        engine.spent = self.engine.spent
+        with input_read():
+            return self.enter_context(engine)
 
 
 def _device(name: str) -> torch.device:

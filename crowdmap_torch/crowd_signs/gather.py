@@ -11,7 +11,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, pairs_within
 from crowdmap_torch.geometry.trajectory import station as along_track
-from crowdmap_torch.noise.pose_prior import stated_sigmas
+from crowdmap_torch.noise.stated_sigmas import stated_sigmas
 from crowdmap_torch.tables import Journey, Signs, Tracklets
 
 _FASTEST_MPS = 70.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
+from typing import Any
 
 import torch
 
@@ -17,12 +18,22 @@ class Processes(Engine):
 
     def __init__(self, workers: int) -> None:
         super().__init__()
+        self._most = workers
         self._pool = Workers(workers, torch.set_num_threads, 1)
 
     @property
     def free(self) -> int:
         """Processes that are there or may be begun, and do nothing."""
         return self._pool.free
+
+    @property
+    def most_hosts(self) -> int:
+        """As many as processes."""
+        return self._most
+
+    def host(self) -> _Beside:
+        """A process of its own."""
+        return _Beside()
 
     def submit(self, number: int, call: Call) -> None:
         """Hands a task to a process."""
@@ -41,3 +52,23 @@ class Processes(Engine):
     ) -> None:
         """Ends the processes."""
         self._pool.__exit__(kind, error, traceback)
+
+
+class _Beside:
+    """One process; another one takes its place where it was killed."""
+
+    def __init__(self) -> None:
+        self._pool = Workers(1, torch.set_num_threads, 1)
+
+    def start(self, call: Call) -> None:
+        """Hands it to the process."""
+        self._pool.start(0, call)
+
+    def wait(self) -> Any:
+        """Waits for the process."""
+        ((_, made),) = self._pool.wait()
+        return made
+
+    def end(self) -> None:
+        """Ends the process."""
+        self._pool.__exit__(None, None, None)

@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 from crowdmap_torch.processes.memory import peak_bytes
 from crowdmap_torch.processes.workers import Call, WorkerLost
@@ -47,6 +47,22 @@ class Finished:
     """The most that the process has held by now."""
 
 
+class Host(Protocol):
+    """A worker of its own: calls find what those before them left behind in its modules."""
+
+    def start(self, call: Call) -> None:
+        """Begins a call; the one before is finished."""
+        ...
+
+    def wait(self) -> Any:
+        """Its result; WorkerLost if the worker was killed. What it raises is raised."""
+        ...
+
+    def end(self) -> None:
+        """Ends the worker."""
+        ...
+
+
 class Engine(ABC):
     """Where tasks run; a context manager that ends its workers, whatever ends the block."""
 
@@ -66,6 +82,15 @@ class Engine(ABC):
     @abstractmethod
     def submit(self, number: int, call: Call) -> None:
         """Begins a task; there must be a free worker."""
+
+    @property
+    @abstractmethod
+    def most_hosts(self) -> int:
+        """How many hosts are worth to be begun."""
+
+    @abstractmethod
+    def host(self) -> Host:
+        """A place where calls are made one after the other, and what they leave behind stays; begun by the first one."""
 
     @abstractmethod
     def gather(self) -> list[tuple[int, Finished]]:

@@ -55,6 +55,16 @@ class OnRay(Engine):
         assert self._workers is not None, "entered first"
         return self._workers - len(self._running)
 
+    @property
+    def most_hosts(self) -> int:
+        """One for each core that Ray has, or as many as were asked for."""
+        assert self._workers is not None, "entered first"
+        return self._workers
+
+    def host(self) -> _Actor:
+        """An actor of one core."""
+        return _Actor(self._ray)
+
     def submit(self, number: int, call: Call) -> None:
         """Hands a task to Ray."""
         self._names[number], function, arguments = call
@@ -68,14 +78,9 @@ class OnRay(Engine):
             done, _ = self._ray.wait([*self._running], num_returns=1, timeout=_LOOK_S)
         (reference,) = done
         number = self._running.pop(reference)
-        errors = self._ray.exceptions
         try:
-            reply = self._ray.get(reference)
-        except errors.RayTaskError as error:
-            # Not of the task, whose exceptions are part of the reply: the package is not there, or is another one.
-            reason = str(error.cause if error.cause is not None else error).strip().splitlines()[-1]
-            raise ChildProcessError(f"--engine ray: a worker cannot work: {reason}") from error
-        except errors.RayError as error:
+            reply = _answer_of(self._ray, reference)
+        except self._ray.exceptions.RayError as error:
             kind = type(error).__name__
             text = f"{self._names[number]}: its worker on Ray was lost ({kind})"
             raise WorkerLost(number, text) from None
@@ -122,6 +127,61 @@ class OnRay(Engine):
             raise ConnectionError(
                 f"--address {self._address}: no Ray cluster can be used there ({reason[:200]})"
             ) from error
+
+
+class _Actor:
+    """A worker of Ray that keeps its modules; another one takes its place where it was lost."""
+
+    def __init__(self, ray: Any) -> None:
+        self._ray = ray
+        self._actor: Any = None
+        self._name = ""
+        self._running: Any = None
+
+    def start(self, call: Call) -> None:
+        """Hands it to the actor."""
+        self._name, function, arguments = call
+        if self._actor is None:
+            worker = self._ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(_Worker)
+            self._actor = worker.remote()
+        message = pickle.dumps((function, arguments))
+        self._running = self._actor.work.remote(message, versions())
+
+    def wait(self) -> Any:
+        """Waits for Ray."""
+        done: list[Any] = []
+        while not done:
+            done, _ = self._ray.wait([self._running], num_returns=1, timeout=_LOOK_S)
+        try:
+            reply = _answer_of(self._ray, done[0])
+        except self._ray.exceptions.RayError as error:
+            self._actor = None
+            kind = type(error).__name__
+            raise WorkerLost(0, f"{self._name}: its worker on Ray was lost ({kind})") from None
+        return taken(reply)
+
+    def end(self) -> None:
+        """Ends the actor."""
+        if self._actor is not None:
+            self._ray.kill(self._actor)
+
+
+class _Worker:
+    """What an actor does."""
+
+    def work(self, message: bytes, asked: tuple[str, ...]) -> bytes:
+        """Does a task."""
+        return _work(message, asked)
+
+
+def _answer_of(ray: Any, reference: Any) -> bytes:
+    """A worker's reply; RayError if the worker was lost, ChildProcessError if it cannot work."""
+    try:
+        return ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        # Not of the task, whose exceptions are part of the reply: the package is not there, or is another one.
+        reason = str(error.cause if error.cause is not None else error).strip().splitlines()[-1]
+        raise ChildProcessError(f"--engine ray: a worker cannot work: {reason}") from error
 
 
 def _knock(address: str) -> None:

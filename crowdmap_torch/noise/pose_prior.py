@@ -11,7 +11,7 @@ module's own where it gives them; how far each journey is from them shows when m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -27,6 +27,7 @@ from crowdmap_torch.noise.bias_wander import (
 )
 from crowdmap_torch.noise.pooled_scales import pooled
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.noise.stated_sigmas import sigmas_of
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
@@ -38,10 +39,6 @@ _SWEEPS = 60
 """Alternations between scales and what all journeys share."""
 MOST_NUMBERS = 9
 """Numbers of the drift at a node, at most."""
-LEAST_SIGMA_M = 1e-3
-"""What carrier phases leave under the open sky of a receiver that stands still: who states less states nothing."""
-LEAST_SIGMA_RAD = 1e-5
-"""Likewise of rotations: two seconds of arc, a theodolite's."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +111,40 @@ class PosePrior:
     """What each term touches."""
     wander: BiasWander | None = None
     """How the bias wanders; None: there is no drive that is long enough."""
+    first_cut: int = 0
+    """Cuts of journeys before these."""
+
+    def of_journeys(self, first: int, last: int) -> PosePrior:
+        """The prior of the poses of successive journeys, the `first` to the one before the `last`.
+
+        Journeys and cuts keep their numbers, poses and nodes are counted from the first.
+        """
+        nodes, bounds = self.nodes, self.nodes.journey.new_tensor([first, last])
+        a, b = torch.searchsorted(nodes.journey.contiguous(), bounds).tolist()
+        frames = torch.searchsorted(nodes.of_frame.contiguous(), bounds.new_tensor([a, b])).tolist()
+
+        def own(of: Tensor) -> Tensor:
+            node = of if of.ndim == 1 else of[:, 0]
+            return of[(node >= a) & (node < b)] - a
+
+        of_poses = slice(*frames)
+        of_frame, starts = nodes.of_frame[of_poses] - a, nodes.first[a:b] - frames[0]
+        here = DriftNodes(of_frame, starts, nodes.journey[a:b], nodes.way[a:b])
+        begins, follows, cut = own(self.begins), own(self.follows), own(self.cut)
+        first_cut = self.first_cut + int((self.cut < a).sum())
+        every = torch.arange(first, last, device=cut.device)
+        return replace(
+            self,
+            pose=self.pose[of_poses],
+            nodes=here,
+            begins=begins,
+            follows=follows,
+            cut=cut,
+            far=own(self.far),
+            slots=_slots(here, begins, follows, cut, first_cut, every),
+            wander=self.wander and replace(self.wander, far=own(self.wander.far)),
+            first_cut=first_cut,
+        )
 
     @property
     def scale_count(self) -> int:
@@ -151,7 +182,7 @@ class PosePrior:
         """The cut that each such stretch begins at and the one that it ends at; -1: none."""
         chain = self.chain
         found = torch.full((len(self.journey_of_chain), 2), -1, device=chain.device)
-        number = torch.arange(len(self.cut), device=chain.device)
+        number = self.first_cut + torch.arange(len(self.cut), device=chain.device)
         found[chain[self.cut], 0] = number
         found[chain[self.cut - 1], 1] = number
         return found
@@ -172,6 +203,7 @@ class PosePrior:
         """Absolute and relative regularisation of the poses, the sigmas scaled."""
         nodes = self.nodes
         bias, drift = self._scaled(scale)
+        bias = bias[self.slots["pose_bias"][0][1]]
         noise = self.white_sigma * white_scale.repeat_interleave(3, dim=1)
         white = (noise.square() + self.within_stretch(scale)).sqrt()
         journey = nodes.journey
@@ -354,7 +386,9 @@ def pose_prior(
     """
     bias, drift = (
         torch.stack(part)
-        for part in zip(*(_sigmas(journey, positioning, pose) for journey in journeys), strict=True)
+        for part in zip(
+            *(sigmas_of(journey, positioning, pose) for journey in journeys), strict=True
+        )
     )
     length = pose.new_tensor([positioning.drift_length_m] * 3 + [positioning.rotation_length_m] * 3)
     white = pose.new_tensor([positioning.white_sigma_m] * 3 + [positioning.white_sigma_rad] * 3)
@@ -365,21 +399,7 @@ def pose_prior(
     follows = torch.nonzero(follows)[:, 0]
     far = nodes_apart(nodes.journey, nodes.way, config.scale_lag_m)
     every = torch.arange(len(journeys), device=pose.device)
-    frame = torch.arange(len(pose), device=pose.device)
-    number = torch.arange(len(cut), device=pose.device)
-    at_cut, of_cut = ("cut", number), ("bias", nodes.journey[cut])
-    slots = {
-        "pose_before_cut": (("drift", cut - 1), at_cut, of_cut),
-        "pose_behind_cut": (at_cut, ("drift", cut), of_cut),
-        "pose_bias": (("bias", every),),
-        "pose_absolute": (("drift", begins), ("bias", nodes.journey[begins])),
-        "pose_relative": (
-            ("drift", follows),
-            ("drift", follows + 1),
-            ("bias", nodes.journey[follows]),
-        ),
-        "pose_white": (("pose", frame), ("drift", nodes.of_frame)),
-    }
+    slots = _slots(nodes, begins, follows, cut, 0, every)
     length = length.expand(len(journeys), 6)
     wander, reach = None, positioning.wander_length_m
     wanders = wandering_drives(
@@ -396,40 +416,30 @@ def pose_prior(
     )
 
 
-def stated_sigmas(journey: Journey) -> tuple[Float[Tensor, " 3"] | None, Float[Tensor, ""] | None]:
-    """The module's own sigmas of position [m] and rotation [rad], the medians of its frames; None where it states none.
-
-    A sigma of zero, or below what any receiver or gyro can know of where it is, is no statement.
-    """
-    position, rotation = journey.sigma_position, journey.sigma_rotation
-    if position is not None:
-        position = position.median(0).values
-        position = position if bool((position >= LEAST_SIGMA_M).all()) else None
-    if rotation is not None:
-        rotation = rotation.median()
-        rotation = rotation if bool(rotation >= LEAST_SIGMA_RAD) else None
-    return position, rotation
-
-
-def _sigmas(
-    journey: Journey, positioning: PositioningNoise, like: Tensor
-) -> tuple[Float[Tensor, " 6"], Float[Tensor, " 6"]]:
-    """Sigmas of bias and drift of one journey, as its module or else `positioning` gives them."""
-    drift = like.new_tensor([positioning.drift_sigma_m] * 3)
-    bias = like.new_tensor(positioning.bias_sigma_m)
-    turn = like.new_tensor([positioning.rotation_sigma_rad] * 3)
-    tilt = like.new_tensor([positioning.bias_sigma_rad] * 3)
-    # The module gives the sigma of both together; of a small one the drift takes half.
-    position, rotation = stated_sigmas(journey)
-    if position is not None:
-        total = position.to(like).square()
-        drift = torch.minimum(drift.square(), total / 2).sqrt()
-        bias = (total - drift.square()).sqrt()
-    if rotation is not None:
-        total = rotation.to(like).square()
-        tilt = torch.minimum(tilt.square(), total / 2).sqrt()
-        turn = (total - tilt.square()).sqrt()
-    return torch.cat((bias, tilt)), torch.cat((drift, turn))
+def _slots(
+    nodes: DriftNodes,
+    begins: Int[Tensor, " c"],
+    follows: Int[Tensor, " e"],
+    cut: Int[Tensor, " s"],
+    first_cut: int,
+    journeys: Int[Tensor, " j"],
+) -> dict[str, tuple[tuple[str, Tensor], ...]]:
+    """What each term touches."""
+    frame = torch.arange(len(nodes.of_frame), device=cut.device)
+    number = first_cut + torch.arange(len(cut), device=cut.device)
+    at_cut, of_cut = ("cut", number), ("bias", nodes.journey[cut])
+    return {
+        "pose_before_cut": (("drift", cut - 1), at_cut, of_cut),
+        "pose_behind_cut": (at_cut, ("drift", cut), of_cut),
+        "pose_bias": (("bias", journeys),),
+        "pose_absolute": (("drift", begins), ("bias", nodes.journey[begins])),
+        "pose_relative": (
+            ("drift", follows),
+            ("drift", follows + 1),
+            ("bias", nodes.journey[follows]),
+        ),
+        "pose_white": (("pose", frame), ("drift", nodes.of_frame)),
+    }
 
 
 def _begins(journey: Int[Tensor, " n"]) -> Tensor:

@@ -13,8 +13,8 @@ one solve. Tangents of points so near to each other are taken for those of one p
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,9 +24,8 @@ from crowdmap_torch.optim.problem import Problem, Values, retract
 from crowdmap_torch.optim.solvers.assembly import Costs, cost_and_gradient
 from crowdmap_torch.optim.solvers.normal_equations import Correctable, Tangents
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
+_Dot = Callable[[Tensor, Tensor], Tensor]
+"""The product of two vectors of everybody's tangents."""
 _SERVES = 0.5
 """A correction that lowers the cost by less than this share of what its model promises is the last one with its matrix."""
 
@@ -74,19 +73,25 @@ class _Pair:
     """Of the gradient, y."""
     solved: Float[Tensor, " n"]
     """H^-1 y."""
+    curvature: Float[Tensor, ""]
+    """s.y."""
 
-    @property
-    def curvature(self) -> Float[Tensor, ""]:
-        """s.y."""
-        return self.move @ self.change
-
-    def kept_positive(self) -> _Pair:
-        """The same with at least a share of the curvature that H has along the move (Powell 1978)."""
-        expected = self.move @ self.lifted
-        lacking = (_LEAST * expected - self.curvature).clamp_min(0)
-        share = lacking / (expected - self.curvature).where(lacking > 0, 1)
-        change = torch.lerp(self.change, self.lifted, share)
-        return _Pair(self.move, self.lifted, change, torch.lerp(self.solved, self.move, share))
+    @classmethod
+    def of(
+        cls,
+        dot: _Dot,
+        move: Float[Tensor, " n"],
+        lifted: Float[Tensor, " n"],
+        change: Float[Tensor, " n"],
+        solved: Float[Tensor, " n"],
+    ) -> _Pair:
+        """That of a move, with at least a share of the curvature that H has along it (Powell 1978)."""
+        expected, curvature = dot(move, lifted), dot(move, change)
+        lacking = (_LEAST * expected - curvature).clamp_min(0)
+        share = lacking / (expected - curvature).where(lacking > 0, 1)
+        change = torch.lerp(change, lifted, share)
+        solved = torch.lerp(solved, move, share)
+        return cls(move, lifted, change, solved, dot(move, change))
 
 
 def corrected(
@@ -107,13 +112,17 @@ def corrected(
     gradient, newton = packed(normal.tangent_gradient, step), move
     lifted = -gradient
     converged = torch.zeros_like(first.costs.total, dtype=torch.bool)
+
+    def dot(one: Float[Tensor, " n"], other: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+        return problem.dot(one, other, step)
+
     for count in range(1, most + 1):
         new = packed(normal.correct(unpacked(here.gradient, step)), step)
-        pair = _Pair(move, lifted, here.gradient - gradient, newton - new)
-        pairs, gradient, newton = (*pairs, pair.kept_positive()), here.gradient, new
-        move, lifted = _quasi_newton(gradient, newton, pairs)
+        pair = _Pair.of(dot, move, lifted, here.gradient - gradient, newton - new)
+        pairs, gradient, newton = (*pairs, pair), here.gradient, new
+        move, lifted = _quasi_newton(dot, gradient, newton, pairs)
         at = Point.of(problem, retract(problem, here.values, unpacked(move, step)), step)
-        decrease, promised = here.costs.total - at.costs.total, -(gradient @ move) / 2
+        decrease, promised = here.costs.total - at.costs.total, -dot(gradient, move) / 2
         # Neither is it taken where it is not a number.
         if not bool(decrease > 0):
             return Corrected(here, count, converged)
@@ -124,17 +133,17 @@ def corrected(
 
 
 def _quasi_newton(
-    gradient: Float[Tensor, " n"], newton: Float[Tensor, " n"], pairs: Sequence[_Pair]
+    dot: _Dot, gradient: Float[Tensor, " n"], newton: Float[Tensor, " n"], pairs: Sequence[_Pair]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """The step s by the corrected matrix, of the one `newton` = -H^-1 g, and H s."""
     left, step, shares = gradient, newton, []
     for pair in reversed(pairs):
-        share = (pair.move @ left) / pair.curvature
+        share = dot(pair.move, left) / pair.curvature
         left, step = left - share * pair.change, step + share * pair.solved
         shares.append(share)
     lifted = -left
     for pair, share in zip(pairs, reversed(shares), strict=True):
-        further = -(share + (pair.change @ step) / pair.curvature)
+        further = -(share + dot(pair.change, step) / pair.curvature)
         step, lifted = step + further * pair.move, lifted + further * pair.lifted
     return step, lifted
 

@@ -308,7 +308,7 @@ def _scale(weight: Float[Tensor, " m"] | Float[Tensor, "m d"]) -> Float[Tensor, 
 def term_costs(
     problem: Problem, values: Values, *, chunk_rows: int = CHUNK_ROWS
 ) -> dict[str, Float[Tensor, " groups"]]:
-    """`1/2 sum rho` of every term, for each of the independent problems."""
+    """`1/2 sum rho` of every term, for each of the independent problems; of terms that others have as well."""
     first = next(iter(values.values()))
     costs = {}
     for name, term in problem.terms.items():
@@ -316,7 +316,7 @@ def term_costs(
         losses = in_order(lambda piece: _losses(problem, piece, values), pieces, first.device)
         total = torch.stack([first.new_zeros(problem.group_count), *losses]).sum(0)
         costs[name] = total
-    return costs
+    return problem.together.sum(costs)
 
 
 def _losses(problem: Problem, piece: CostTerm, values: Values) -> Float[Tensor, " groups"]:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.robust import Loss, Quadratic
 from crowdmap_torch.optim.shared_errors import SharedErrors
+from crowdmap_torch.processes.together import ALONE, Together
 
 Values = Mapping[str, Tensor]
 """The value of every block of every variable, by name; blocks are the leading axis."""
@@ -114,6 +115,24 @@ class Problem:
     variables: Mapping[str, Variable]
     terms: Mapping[str, CostTerm]
     group_count: int = 1
+    together: Together = ALONE
+    """Those who have other terms of the same problem: costs, and gradients of what is in `common`, are sums over all."""
+    common: frozenset[str] = frozenset()
+    """Variables whose blocks all of them have; others are their own."""
+
+    def dot(
+        self, first: Float[Tensor, " n"], second: Float[Tensor, " n"], like: Mapping[str, Tensor]
+    ) -> Float[Tensor, ""]:
+        """The product of two vectors of all tangents, of everybody's; `like` has one's own, one behind the other."""
+        if self.together.is_alone:
+            return first @ second
+        at, total = 0, first.new_zeros(())
+        for name, tangent in like.items():
+            here = slice(at, at + tangent.numel())
+            at = here.stop
+            if name not in self.common or self.together.leads:
+                total = total + first[here] @ second[here]
+        return self.together.sum(total)
 
     def group_of_rows(self, term: CostTerm) -> Int[Tensor, " m"] | None:
         """The independent problem of each row; None where there is one problem."""

@@ -74,7 +74,7 @@ def test_what_is_known_of_poses_is_found_anew_when_scales_or_judgements_have_cha
     for change in (lambda: bundle.prior_scale[1, 0].mul_(1.05), lambda: bundle.judged.add_(1)):
         change()
         assert bundle.evidence() is None
-        bundle.told_at.copy_(bundle._scales())
+        bundle.told_at.copy_(bundle.scales())
 
 
 def test_the_papers_cost_weighs_every_corner_and_lane_point_by_itself_and_all_pixels_alike(

@@ -12,7 +12,8 @@ from worlds.pose_priors import GIVEN, make_prior
 from worlds.small_world import Builder
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.noise.pose_prior import PosePrior, stated_sigmas
+from crowdmap_torch.noise.pose_prior import PosePrior
+from crowdmap_torch.noise.stated_sigmas import stated_sigmas
 from crowdmap_torch.optim.linearize import linearize
 from crowdmap_torch.optim.problem import Problem, Variable, euclidean
 from crowdmap_torch.optim.solvers.dense import DenseBackend

@@ -105,7 +105,7 @@ def assemble(
 
 
 def cost_and_gradient(problem: Problem, values: Values) -> tuple[Costs, dict[str, Tensor]]:
-    """The cost of every term, and the gradient [n, k] by the tangents of every variable."""
+    """The cost of every term, and the gradient [n, k] by the tangents of every variable; of everybody's terms."""
     gradient = {
         name: values[name].new_zeros(kind.tangent_dim, len(values[name]))
         for name, kind in problem.variables.items()
@@ -116,7 +116,27 @@ def cost_and_gradient(problem: Problem, values: Values) -> tuple[Costs, dict[str
             gradient[name].index_add_(1, block, pull)
 
     costs = assemble(problem, values, row_gradients, add)
-    return costs, {name: of.mT.contiguous() for name, of in gradient.items()}
+    found = {name: of.mT.contiguous() for name, of in gradient.items()}
+    costs, in_common = of_everybody(
+        problem, costs, {name: of for name, of in found.items() if name in problem.common}
+    )
+    return costs, {**found, **in_common}
+
+
+def of_everybody(
+    problem: Problem, costs: Costs, in_common: Mapping[str, Tensor]
+) -> tuple[Costs, dict[str, Tensor]]:
+    """Costs, and what there is by name of what all have in common, added up over all who have terms of the problem."""
+    if problem.together.is_alone:
+        return costs, dict(in_common)
+    # In one meeting.
+    own = {f"cost {name}": cost for name, cost in costs.by_term.items()}
+    total = problem.together.sum({**own, **{f"of {name}": of for name, of in in_common.items()}})
+    by_term, summed = (
+        {key.removeprefix(kind): of for key, of in total.items() if key.startswith(kind)}
+        for kind in ("cost ", "of ")
+    )
+    return Costs(torch.stack(list(by_term.values())).sum(0), by_term), summed
 
 
 def pairs(count: int) -> Iterator[tuple[int, int]]:

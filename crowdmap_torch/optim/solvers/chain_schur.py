@@ -21,8 +21,8 @@ of C, and what it has in common with the chains is no part of B but F, `border_l
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Float
@@ -38,7 +38,7 @@ from crowdmap_torch.optim.solvers.block_elimination import (
     fill_chain,
     lead_of,
 )
-from crowdmap_torch.optim.solvers.border import ChainBorder
+from crowdmap_torch.optim.solvers.border import ChainBorder, weighted_sums
 from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
 from crowdmap_torch.optim.solvers.known_landmarks import KnownLandmarks
@@ -164,8 +164,8 @@ class Factor:
 
     leads: tuple[tuple[Lead, ...], ...]
     """By part and round."""
-    reduced: TiledCholesky
-    """Of S."""
+    reduced: TiledCholesky | None
+    """Of S; None where S is a part of a sum."""
     of: Float[Tensor, "e k"]
     """The gradient a of the equations that they are of."""
     is_undamped: bool
@@ -235,9 +235,10 @@ class ChainNormalEquations:
         if self.factorise(nothing, added) is None:
             raise ValueError("the chains' blocks are not positive definite without damping")
         workspace, factor = self.workspace, self.workspace.factor
-        assert factor is not None
+        assert factor is not None and factor.reduced is not None
+        chains = self.chains(factor.leads)
         return LandmarkCovariance(
-            *(self.structure.where, factor.reduced, self.chains(factor.leads)),
+            *(self.structure.where, factor.reduced, partial(weighted_sums, chains)),
             lambda: workspace.factor is factor,
         )
 
@@ -260,15 +261,9 @@ class ChainNormalEquations:
 
     def border_information(self) -> BorderInformation:
         """Information on the border, everything else marginalised, as the last step had it."""
-        where, begin = self.structure.where, self.structure.border_begin
         factor = self.workspace.factor
-        assert factor is not None, "solved first"
-        upper = factor.reduced.trailing(begin)
-        matrix = upper.mT @ upper - torch.diag(factor.added[begin:])
-        entries = {
-            name: where.entries(name, slice(None)) - begin for name in self.structure.plan.border
-        }
-        return BorderInformation(matrix, entries)
+        assert factor is not None and factor.reduced is not None, "solved first"
+        return border_information(self.structure, factor.reduced, factor.added)
 
     @cached_property
     def known(self) -> KnownLandmarks:
@@ -286,25 +281,38 @@ class ChainNormalEquations:
 
         The arguments are added to the diagonals of A and C. Of S only the upper triangle counts.
         """
+        system, eliminated = self.reduce(added_x, added_y)
+        # What is not positive definite on the way gives numbers that are not finite, and the factors none either.
+        reduced = TiledCholesky.of(system)
+        if reduced is None:
+            self.workspace.factor = None
+            return None
+        self.workspace.factor = replace(eliminated, reduced=reduced)
+        return system.right_side
+
+    def reduce(
+        self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"] | None
+    ) -> tuple[TileMatrix, Factor]:
+        """The reduced system S and its right-hand side, and what the elimination leaves behind, for later solves.
+
+        The arguments are added to the diagonals of A and C.
+        """
         structure, system = self.structure, self.workspace.system
         system.copy_from(self.hessian, structure.direct_tiles)
         system.right_side.copy_(self.gradient)
-        system.add_diagonal(added_y)
+        if added_y is not None:
+            system.add_diagonal(added_y)
         products = Products(system)
         leads = tuple(self._eliminate(part, added_x, products) for part in structure.parts)
         products.subtract()
         self.chains(leads).add(system, self.eliminated_gradient)
-        # What is not positive definite on the way gives numbers that are not finite, and the factors none either.
-        reduced = TiledCholesky.of(system)
-        if reduced is None:
-            return None
         is_undamped = not bool(
             (added_x > _NEXT_TO_NOTHING * self.diagonal.diagonal(dim1=-2, dim2=-1)).any()
         )
-        self.workspace.factor = Factor(
-            leads, reduced, self.eliminated_gradient, is_undamped, added_y
-        )
-        return system.right_side
+        added = torch.zeros_like(self.gradient) if added_y is None else added_y
+        factor = Factor(leads, None, self.eliminated_gradient, is_undamped, added)
+        self.workspace.factor = factor
+        return system, factor
 
     def _eliminate(
         self, part: Part, added: Float[Tensor, "e k"], products: Products
@@ -348,8 +356,9 @@ class ChainNormalEquations:
 
     def solve_reduced(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
         """S^-1 of right-hand sides, by the last factors."""
-        assert self.workspace.factor is not None
-        return self.workspace.factor.reduced.solve(right_side)
+        factor = self.workspace.factor
+        assert factor is not None and factor.reduced is not None
+        return factor.reduced.solve(right_side)
 
     def solve_eliminated(self, right_side: Float[Tensor, "e k c"]) -> Float[Tensor, "e k c"]:
         """A^-1 of right-hand sides, by the last factors.
@@ -391,6 +400,17 @@ class ChainNormalEquations:
     def solve_alone(self, right_side: Float[Tensor, "e k"]) -> Float[Tensor, "e k"]:
         """A^-1 of one right-hand side, by the last factors."""
         return self.solve_eliminated(right_side[..., None])[..., 0]
+
+
+def border_information(
+    structure: ChainStructure, reduced: TiledCholesky, added: Float[Tensor, " r"]
+) -> BorderInformation:
+    """That on the border of a reduced system, by its factors, to whose diagonal so much was `added`."""
+    where, begin = structure.where, structure.border_begin
+    upper = reduced.trailing(begin)
+    matrix = upper.mT @ upper - torch.diag(added[begin:])
+    entries = {name: where.entries(name, slice(None)) - begin for name in structure.plan.border}
+    return BorderInformation(matrix, entries)
 
 
 def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> ChainNormalEquations:

@@ -151,6 +151,8 @@ class ReducibleSums(ChainSums):
         for name, offset in where.offset.items():
             square = self.by_variable.hessian(name).permute(1, 2, 0)
             self._matrix.add(offset, offset, square)
+        if not self.structure.plan.is_whole:
+            return self._matrix
         # What is nobody's column stands for itself.
         gap = torch.nonzero(~where.used[0])[:, 0]
         self._matrix.add(gap, gap, self._matrix.flat.new_ones(1, 1, len(gap)))

@@ -169,7 +169,8 @@ def analyse(
     beside = border_beside(keys, landmarks.count, owner, plan.border)
     by_rows = [of for of in beside if of.variable in seen_with]
     direct = direct_pattern(stays, landmarks, keys, pairs, by_rows)
-    reduced = reduced_pattern(direct, stays, *_bound(builders, owner.device), beside)
+    bound = _bound(builders, owner.device)
+    reduced = reduced_pattern(direct, stays, *bound, beside, is_factored=plan.is_whole)
     couplings = couplings.placed(landmarks)
     parts = [builder.part(reduced) for builder in builders]
     none = [plan.chain.new_zeros(plan.chain_count, 0)]

@@ -129,9 +129,11 @@ def joints_of(
 ) -> Joints | None:
     """Those of equations with B `coupling` and C `hessian`, by what rounds leave behind of A; None: there are none."""
     plan = structure.plan
-    if plan.joints is None or plan.joint is None or not len(structure.where.offset[plan.joints]):
+    if plan.joints is None or plan.joint is None or not bool((plan.joint >= 0).any()):
         return None
-    at = structure.where.entries(plan.joints, slice(None))
+    # Of other drives' joints nothing is known here.
+    used = torch.unique(plan.joint[plan.joint >= 0])
+    at = structure.where.entries(plan.joints, used)
     count, width = at.shape
     like = next(iter(coupling.values()))
     chains = len(plan.joint)
@@ -157,8 +159,10 @@ def joints_of(
         goes_with[part.block] = U
         taken += own
     known = plan.joint >= 0
+    number = torch.searchsorted(used, plan.joint.clamp_min(0))
     # Of a chain that has none of its own, or one, nothing goes with the others that stand here.
-    joint = torch.where(known, plan.joint, plan.joint.amax(1, keepdim=True)).clamp_min(0)
+    number = torch.where(known, number, -1)
+    joint = torch.where(known, number, number.amax(1, keepdim=True)).clamp_min(0)
     # Joints that one chain lies between are of one drive.
     inner = torch.nonzero(known.all(1))[:, 0]
     follows = torch.zeros(count, dtype=torch.bool, device=at.device)

@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.border import ChainBorder, weighted_sums
+from crowdmap_torch.optim.solvers.border import WeightedSums
 from crowdmap_torch.optim.solvers.layout import Layout, read_entries
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 
+SumsOfChains = Callable[[Tensor, Tensor, int], tuple[Tensor, WeightedSums] | None]
 _COLUMNS = 256
 """Functions whose joint covariance is solved for at once; bounds the memory."""
 
@@ -27,12 +28,15 @@ class LandmarkCovariance:
         self,
         where: Layout,
         factor: TiledCholesky,
-        chains: ChainBorder,
+        sums: SumsOfChains,
         is_current: Callable[[], bool],
     ) -> None:
-        """`is_current` says whether the factors are there still: others may come into their memory."""
+        """`sums` are the `weighted_sums` of the chains.
+
+        `is_current` says whether the factors are there still: others may come into their memory.
+        """
         self.where = where
-        self._factor, self._chains, self._is_current = factor, chains, is_current
+        self._factor, self._sums, self._is_current = factor, sums, is_current
         # Of its own: the next factors come where these are.
         self._inverse = factor.selected_inverse()
 
@@ -63,7 +67,9 @@ class LandmarkCovariance:
         ValueError where the factors are there no more.
         """
         self._check()
-        found, sums = weighted_sums(self._chains, weight, of, count)
+        told = self._sums(weight, of, count)
+        assert told is not None, "asked of who has the factors"
+        found, sums = told
         m = weight.shape[-1]
         each = max(_COLUMNS // m, 1)
         for begin in range(0, count, each):

@@ -41,6 +41,8 @@ class EliminationPlan:
     room: Int[Tensor, " keys"] | None = None
     """What eliminated blocks may be coupled to (`planned_ahead`): the order of elimination is kept while they are coupled to
     nothing else. None: it is found whenever they are coupled to others."""
+    is_whole: bool = True
+    """Whether these are all chains: then the reduced system is factored, else it is a part of a sum (`journey_system`)."""
     part: Int[Tensor, " chains"] | None = None
     """Which of several parts each chain is of (`planned_ahead`): parts are eliminated one after the other, and those that
     see other roads have little in common. None: all at once."""

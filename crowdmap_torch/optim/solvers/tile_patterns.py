@@ -71,6 +71,9 @@ def direct_pattern(
     present = _bound(keys // count, keys % count, stays, width)
     number = torch.arange(len(pairs), device=device)
     present |= _bound(number.repeat_interleave(2), pairs.flatten(), stays, width)
+    # Every block is bound to itself, and may lie in two tiles.
+    first, last = stays.column // width, (stays.column + stays.width - 1) // width
+    present[first.cpu().numpy(), last.cpu().numpy()] = True
     border = stays.column[len(landmarks.column) :] // width
     if len(border):
         present[int(border.min()) :, int(border.min()) :] = True
@@ -111,14 +114,17 @@ def reduced_pattern(
     group: Int[Tensor, " n"],
     place: Int[Tensor, " n"],
     beside: Sequence[Beside],
+    *,
+    is_factored: bool = True,
 ) -> TilePattern:
-    """That of S and of its factor: windows of groups bind the landmarks at their places, in the order of columns.
+    """That of S, and of its factor: windows of groups bind the landmarks at their places, in the order of columns.
 
     Chains bind the landmarks that they are coupled to with what they have `beside` them of the border.
     """
     present = _bound(group, stays.ordered[place], stays, direct.width)
     present |= direct.present.cpu().numpy() | _between(stays, beside, direct.width)
-    return TilePattern.of(direct.dim, direct.width, present, direct.own.device).filled()
+    found = TilePattern.of(direct.dim, direct.width, present, direct.own.device)
+    return found.filled() if is_factored else found
 
 
 def tiles_of_factor(

@@ -1,0 +1,261 @@
+"""Bundle adjustment shared out: drives in convoys, wherever an engine has hosts for them, the map with their leader.
+
+A convoy is some successive drives with their poses and observations, and a copy of all that is unknown of the map and of
+the border. Each takes the steps of the one adjustment, in time with the others: they meet where sums over all drives are
+needed, costs, products, the reduced systems (`optim.solvers.journey_system`), and where scales are found of everybody's
+residuals. Between two steps the bundle that was shared out has everything: from it a convoy that was lost begins anew.
+
+How many convoys there are depends on the way that was driven alone, and sums are taken in their order: the map has the same
+bits on any engine with any number of workers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import TracebackType
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from crowdmap_torch.adjustment.bias_sums import sums_of_bias
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import Fleet
+from crowdmap_torch.adjustment.config import AdjustConfig
+from crowdmap_torch.adjustment.parts import Observations, Priors, SharedOut, Unknowns
+from crowdmap_torch.adjustment.steps import adjust_step
+from crowdmap_torch.fleet.company import Company, Program
+from crowdmap_torch.fleet.engine import Engine
+from crowdmap_torch.fleet.here import InProcess
+from crowdmap_torch.optim.levenberg_marquardt import LmState
+from crowdmap_torch.optim.solvers.journey_system import JourneyBackend, JourneyEquations
+from crowdmap_torch.optim.solvers.normal_equations import MapCovariance
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.processes.memory import give_back
+from crowdmap_torch.processes.together import Member, Together
+
+_OWN = ("pose", "drift")
+"""The unknowns that each convoy has of its own drives alone."""
+_ROWS = ("match_t", "match_normal", "match_valid")
+"""What a bundle keeps of each lane point."""
+
+
+@dataclass(frozen=True)
+class Convoy:
+    """Some successive drives of a bundle, between two steps of its adjustment: all that goes to where their work is done."""
+
+    unknowns: Unknowns
+    observations: Observations
+    priors: Priors
+    config: AdjustConfig
+    plan: EliminationPlan
+    own: Bool[Tensor, " j"]
+    """Which journeys they are."""
+    kept: dict[str, Tensor]
+    """What the bundle keeps beside its unknowns, by name."""
+    state: LmState | None
+    """None: no step is to be taken."""
+
+    def bundle(self, together: Together, whole: Bundle | None = None) -> Bundle:
+        """Their bundle, which works with others `together`; with their leader's is the `whole`."""
+        shared_out = SharedOut(together, self.plan, self.own, len(self.kept["given_up"]))
+        own = self.unknowns, self.observations, self.priors, self.config
+        bundle = Bundle(*own, shared_out, whole)
+        bundle.load_state_dict({**bundle.state_dict(), **self.kept})
+        return bundle
+
+
+def convoy(bundle: Bundle, state: LmState | None, first: int, last: int) -> Convoy:
+    """The journeys of a bundle from the `first` to the one before the `last`, where its adjustment stands."""
+    nodes, values = bundle.prior.nodes, bundle.values()
+    ends = nodes.journey.new_tensor([first, last])
+    of_nodes = slice(*torch.searchsorted(nodes.journey.contiguous(), ends).tolist())
+    ends = ends.new_tensor([of_nodes.start, of_nodes.stop])
+    of_poses = slice(*torch.searchsorted(nodes.of_frame.contiguous(), ends).tolist())
+    own = {"pose": of_poses, "drift": of_nodes}
+    here = torch.arange(len(bundle.prior_scale), device=ends.device)
+    here = (here >= first) & (here < last)
+    corner, point = here[bundle.corners.journey], here[bundle.lane_points.journey]
+    corners, points = bundle.corners[corner], bundle.lane_points[point]
+    beside = bundle.beside - of_poses.start
+    is_here = (beside >= 0) & (bundle.beside < of_poses.stop)
+    kept = {k: v for k, v in bundle.state_dict().items() if k not in bundle.unknown_names}
+    kept |= {name: kept[name][point] for name in _ROWS}
+    kept["poses_left"] = kept["poses_left"][of_poses]
+
+    def of_all(name: str, value: Tensor) -> Tensor:
+        return value[own[name]] if name in own else value
+
+    return Convoy(
+        unknowns=Unknowns(
+            {name: of_all(name, value) for name, value in values.items()},
+            *(bundle.frame[of_poses], bundle.lane_count),
+        ),
+        observations=Observations(
+            replace(corners, frame=corners.frame - of_poses.start),
+            replace(points, frame=points.frame - of_poses.start),
+            *(bundle.begun_matches[point], bundle.lenses),
+        ),
+        priors=Priors(
+            bundle.prior.of_journeys(first, last),
+            bundle.fixed,
+            torch.where(is_here, beside, -1),
+            _of_poses(bundle.fleet, of_poses),
+        ),
+        config=bundle.config,
+        plan=_plan(bundle, of_nodes, of_poses),
+        own=here,
+        kept=kept,
+        state=state
+        and replace(
+            state,
+            values={name: of_all(name, value) for name, value in state.values.items()},
+            normal=None,
+        ),
+    )
+
+
+def _of_poses(fleet: Fleet, poses: slice) -> Fleet:
+    return replace(
+        fleet,
+        of_pose=fleet.of_pose[poses],
+        velocity=fleet.velocity[poses],
+        turning=fleet.turning[poses],
+    )
+
+
+def _plan(bundle: Bundle, nodes: slice, poses: slice) -> EliminationPlan:
+    """What is eliminated of some poses and nodes; a leader has none, and is the one that factors."""
+    plan = bundle.plan
+    assert plan.carrier is not None and plan.joint is not None
+    chain = plan.chain[nodes]
+    first, end = (int(chain[0]), int(chain[-1]) + 1) if len(chain) else (0, 0)
+    leaves, count = poses.stop - poses.start, nodes.stop - nodes.start
+    room = plan.room
+    if room is not None:
+        # Keys count leaves, then nodes, each with all landmarks.
+        stays = sum(len(bundle.values()[name]) for name in bundle.names if name not in _OWN)
+        landmarks = stays - sum(len(bundle.values()[name]) for name in plan.border)
+        block, landmark = room // landmarks, room % landmarks
+        leaf, node = block - poses.start, block - plan.leaf_count - nodes.start
+        is_leaf = (leaf >= 0) & (leaf < leaves) & (block < plan.leaf_count)
+        is_node = (node >= 0) & (node < count)
+        block = torch.where(is_leaf, leaf, node + leaves)
+        room = (block * landmarks + landmark)[is_leaf | is_node]
+    part = plan.part
+    if part is not None:
+        _, part = torch.unique(part[first:end], return_inverse=True)
+    return replace(
+        plan,
+        chain=chain - first,
+        carrier=plan.carrier[poses] - nodes.start,
+        border={name: block[first:end] for name, block in plan.border.items()},
+        joint=plan.joint[first:end],
+        room=room,
+        part=part,
+        is_whole=not count,
+    )
+
+
+# ---- the program of a convoy ----
+
+
+def drive_along(member: Member, own: Convoy) -> None:
+    """What a convoy does: steps in time with the others, and its part of covariances, until it is ended."""
+    bundle, state = own.bundle(member), own.state
+    while True:
+        asked, *of = member.told()
+        if asked == "step":
+            assert state is not None
+            state, _ = adjust_step(bundle, state, bundle.backend())
+            give_back()
+            moved = bool(state.accepted.all())
+            member.for_leader(list, _moved(bundle) if moved else ())
+        else:
+            equations = _equations(bundle, *of)
+            equations.share_covariance()
+            equations.sums_of_chains(*sums_of_bias(bundle))
+
+
+def _moved(bundle: Bundle) -> tuple[Tensor, ...]:
+    """What a step changes of what is a convoy's own."""
+    values, kept = bundle.values(), bundle.state_dict()
+    return (*(values[name] for name in _OWN), *(kept[name] for name in _ROWS), bundle.poses_left)
+
+
+@torch.no_grad()
+def _equations(bundle: Bundle, prior_scale: Float[Tensor, "j _"]) -> JourneyEquations:
+    """Those that tell what is known, with sigmas of that scale."""
+    problem, backend = bundle.information(prior_scale), bundle.backend()
+    assert isinstance(backend, JourneyBackend)
+    return backend.assemble(problem, bundle.values())
+
+
+# ---- their leader ----
+
+
+class Convoys:
+    """The convoys of a bundle on the hosts of an engine, a context manager that ends them; and their leader's part."""
+
+    def __init__(self, bundle: Bundle, state: LmState | None, engine: Engine | None = None) -> None:
+        """`bundle` stands where `state` does, and follows step by step; without one no step may be taken."""
+        self.bundle, self.state = bundle, state
+        self._parts = bundle.convoys
+        engine = InProcess() if engine is None else engine
+        self._company = Company(engine, len(self._parts), self._program, "bundle adjustment")
+        self._leader = self._company.leader
+        self._own = convoy(bundle, state, 0, 0).bundle(self._leader, bundle)
+        self._state = convoy(bundle, state, 0, 0).state
+
+    def _program(self, number: int) -> Program:
+        return drive_along, (convoy(self.bundle, self.state, *self._parts[number]),)
+
+    @torch.no_grad()
+    def step(self) -> tuple[LmState, bool]:
+        """`adjust_step` of the bundle."""
+        assert self._state is not None and self.state is not None
+        self._leader.tell(("step",))
+        self._state, finished = adjust_step(self._own, self._state, self._own.backend())
+        found = self._leader.for_leader(list, ())
+        moved = [part for part in found if part]
+        values = dict(self._state.values)
+        if moved:
+            every = [torch.cat(each) for each in zip(*moved, strict=True)]
+            values |= dict(zip(_OWN, every, strict=False))
+            self._follow(values, every[len(_OWN) :])
+        else:
+            values |= {name: self.state.values[name] for name in _OWN}
+        self.state = replace(self._state, values=values, normal=None)
+        self._company.renew()
+        return self.state, finished
+
+    def covariance(
+        self, prior_scale: Float[Tensor, "j _"]
+    ) -> tuple[MapCovariance, Float[Tensor, "j 4 4"]]:
+        """The covariance of what stays, with sigmas of that scale, and that of the journeys' biases."""
+        self._leader.tell(("covariance", prior_scale))
+        covariance = _equations(self._own, prior_scale).covariance()
+        return covariance, covariance.of_sums(*sums_of_bias(self._own))
+
+    def _follow(self, values: dict[str, Tensor], rows: list[Tensor]) -> None:
+        """Has the bundle where the convoys are."""
+        bundle, own = self.bundle, self._own.state_dict()
+        moved = {*_ROWS, "poses_left", *bundle.unknown_names}
+        kept = {name: of for name, of in own.items() if name not in moved}
+        kept |= dict(zip((*_ROWS, "poses_left"), rows, strict=True))
+        for name, of in kept.items():
+            getattr(bundle, name).copy_(of)
+        bundle.fold(values)
+        bundle.relinearise()
+
+    def __enter__(self) -> Convoys:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Ends the convoys."""
+        self._company.__exit__(kind, error, traceback)

@@ -1,0 +1,60 @@
+"""The steps of bundle adjustment: where it starts, and one step, folded into the bundle (V-B)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
+from crowdmap_torch.optim.solvers.normal_equations import MapBackend, MapEquations
+from crowdmap_torch.processes.memory import give_back
+from crowdmap_torch.processes.threads import one_core_each
+
+
+@one_core_each()
+@torch.no_grad()
+def start(bundle: Bundle) -> lm.LmState:
+    """The state before the first step: lanes matched, scales as wide as residuals show, the order of elimination found.
+
+    Of many drives the convoys find their own.
+    """
+    bundle.fold(bundle.values())
+    bundle.refresh()
+    problem, values = bundle.problem(), bundle.values()
+    backend = bundle.backend()
+    if isinstance(backend, ChainBackend) and len(bundle.convoys) == 1:
+        backend.prepare(problem, values)
+    give_back()
+    return lm.init(problem, values, bundle.config.lm)
+
+
+@one_core_each()
+@torch.no_grad()
+def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple[lm.LmState, bool]:
+    """One step of the solver, folded into the bundle, and whether the adjustment is finished.
+
+    Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
+    first come to rest, and when the solver stops. It is finished when that changes nothing.
+    """
+    problem = bundle.problem()
+    normal = state.normal
+    if not isinstance(normal, MapEquations):
+        normal = backend.assemble(problem, state.values)
+        state = replace(state, normal=normal, linearizations=state.linearizations + 1)
+    state = lm.step(problem, state, bundle.config.lm, backend=backend)
+    if not bool(state.accepted.all()):
+        return state, state.done
+    evidence = bundle.evidence() or bundle.told_by(normal)
+    of_border = normal.border_information() if bundle.fleet.kinds else None
+    # The next ones may need memory of their own.
+    del normal
+    bundle.fold(dict(state.values))
+    at_rest = bundle.refresh(evidence, of_border)
+    if at_rest and (state.done or int(bundle.judged) == 0):
+        at_rest = not bundle.judge(backend)
+    if state.done and at_rest:
+        return state, True
+    return lm.changed(state), False

@@ -1,0 +1,309 @@
+"""The map's normal equations as a sum over drives: drives meet in landmarks and in the border alone.
+
+Eliminating all that is a drive's own leaves its summand of the reduced system of `chain_schur`, over the landmarks and the
+blocks of the border that it has to do with:
+
+    S = C + sum_d S_d        S_d = C_d - B_d A_d^-1 B_d^T        S y = -(b + sum_d (b_d - B_d A_d^-1 a_d))
+
+with C and b of what is known of the map without any drive. Members make the summands of their drives, each a
+`JourneySystem`; the leader adds them up in the members' order, factors the sum and tells all of them the step y of what
+stays, with which each finds that of its own. The map is the same to the last bit wherever the members are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.optim.problem import Problem, Values
+from crowdmap_torch.optim.solvers.assembly import Costs, of_everybody
+from crowdmap_torch.optim.solvers.border import ChainBorder, WeightedSums, weighted_sums
+from crowdmap_torch.optim.solvers.chain_schur import (
+    UNOBSERVED_FLOOR,
+    ChainBackend,
+    ChainNormalEquations,
+    border_information,
+)
+from crowdmap_torch.optim.solvers.landmark_covariance import LandmarkCovariance
+from crowdmap_torch.optim.solvers.normal_equations import (
+    DIAGONAL_FLOOR,
+    BorderInformation,
+    ChainChanges,
+    Step,
+    Tangents,
+    failed_step,
+)
+from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
+from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
+from crowdmap_torch.processes.together import Together
+
+
+@dataclass(frozen=True)
+class JourneySystem:
+    """What some drives say of the map at the point where all are: one summand of its normal equations.
+
+    Its cost, and the point, are those of the equations that it comes from.
+    """
+
+    tile: Int[Tensor, "n 2"]
+    """Row and column of every tile that holds anything, in the grid of the landmarks' matrix."""
+    information: Float[Tensor, "n w w"]
+    """The tiles of S_d, those of the diagonal and above it."""
+    row: Int[Tensor, " k"]
+    """The rows of tiles that it has to do with: where its landmarks are."""
+    right_side: Float[Tensor, "k w"]
+    """Of b_d - B_d A_d^-1 a_d, there."""
+
+    @classmethod
+    def of(cls, system: TileMatrix) -> JourneySystem:
+        """A reduced system and its right-hand side; the tensors are copies."""
+        pattern = system.pattern
+        tile = torch.nonzero(pattern.present)
+        padded = system.right_side.new_zeros(pattern.tiles * pattern.width)
+        padded[: pattern.dim] = system.right_side
+        by_row = padded.view(-1, pattern.width)
+        row = torch.nonzero(by_row.any(1))[:, 0]
+        used = system.tiles.flatten(1).any(1)
+        return cls(tile[used], system.tiles[used], row, by_row[row])
+
+    def add_to(self, system: TileMatrix) -> None:
+        """Adds it to a system whose grid is the same and that has its tiles, in place."""
+        pattern = system.pattern
+        area, of_row = pattern.width**2, self.tile[:, 0] * pattern.tiles + self.tile[:, 1]
+        place = pattern.base[: pattern.tiles, : pattern.tiles].flatten()[of_row] // area
+        assert bool((place >= 0).all()), "the sum has the tiles of its summands"
+        system.tiles.index_add_(0, place, self.information)
+        padded = system.flat[pattern.count * area :][: pattern.tiles * pattern.width]
+        padded.view(-1, pattern.width).index_add_(0, self.row, self.right_side)
+
+
+@dataclass
+class JourneyBackend:
+    """Normal equations of a problem of which each member has the drives, and the leader the map.
+
+    The plans are those of the members' own chains, with the landmarks ranked alike; the leader has no chain.
+    """
+
+    plan: EliminationPlan
+    together: Together
+    _chains: ChainBackend = field(init=False, repr=False)
+    _sum: TileMatrix | None = field(default=None, init=False, repr=False)
+    """Of the leader: memory for the sum."""
+
+    def __post_init__(self) -> None:
+        self._chains = ChainBackend(self.plan)
+
+    def assemble(self, problem: Problem, values: Values) -> JourneyEquations:
+        """Normal equations at `values`, of which the last may be solved."""
+        own = self._chains.assemble(problem, values)
+        costs, total = of_everybody(
+            problem,
+            Costs(own.cost, own.term_cost),
+            {"gradient": own.gradient, "diagonal": own.hessian.diagonal()},
+        )
+        present = own.structure.reduced.present
+        self.together.met(partial(self._make_room, own), torch.nonzero(present).to(torch.int32))
+        return JourneyEquations(
+            *(costs.total, costs.by_term, own, self.together),
+            *(total["gradient"], total["diagonal"]),
+            Summed(self._sum),
+        )
+
+    def _make_room(self, own: ChainNormalEquations, tiles: Iterator[Int[Tensor, "n 2"]]) -> None:
+        """Memory for the sum of systems with these tiles, unless it is there already."""
+        pattern = own.structure.reduced
+        present = torch.zeros_like(pattern.present)
+        for tile in tiles:
+            row, column = tile.long().unbind(1)
+            present[row, column] = True
+        if self._sum is not None and (
+            present.shape == self._sum.pattern.present.shape
+            and not bool((present & ~self._sum.pattern.present).any())
+        ):
+            return
+        # The old one goes before the new one comes.
+        self._sum = None
+        device = present.device
+        whole = TilePattern.of(pattern.dim, pattern.width, present.cpu().numpy(), device).filled()
+        self._sum = TileMatrix.zeros(whole, own.gradient)
+
+
+@dataclass
+class Summed:
+    """The sum of all systems: the leader's."""
+
+    system: TileMatrix | None
+    factor: TiledCholesky | None = None
+    added: Float[Tensor, " r"] | None = None
+    """To the diagonal of C."""
+
+    def factorise(
+        self, added: Float[Tensor, " r"], parts: Iterator[JourneySystem]
+    ) -> Float[Tensor, " r"] | None:
+        """The right-hand side of the sum, which is factorised; None: it is not positive definite."""
+        system = self.system
+        assert system is not None, "of the leader"
+        self.factor = None
+        system.flat.zero_()
+        for part in parts:
+            part.add_to(system)
+        system.add_diagonal(added)
+        self.factor, self.added = TiledCholesky.of(system), added
+        return None if self.factor is None else system.right_side
+
+    def solve(self, right_side: Float[Tensor, " r"]) -> Float[Tensor, " r"]:
+        """The inverse of the sum times a right-hand side, by the last factors."""
+        assert self.factor is not None
+        return self.factor.solve(right_side[:, None])[:, 0]
+
+
+@dataclass(frozen=True)
+class JourneyEquations:
+    """The quadratic model of all, as one of them has it; letters as in `chain_schur`."""
+
+    cost: Float[Tensor, " 1"]
+    """Of all."""
+    term_cost: Mapping[str, Float[Tensor, " 1"]]
+    own: ChainNormalEquations
+    """Of one's own terms."""
+    together: Together
+    gradient: Float[Tensor, " r"]
+    """b, of all."""
+    diagonal: Float[Tensor, " r"]
+    """Of C, of all."""
+    summed: Summed = field(repr=False)
+
+    def solve(self, damping: Float[Tensor, " 1"]) -> Step:
+        """The damped step of what stays, and of one's own chains."""
+        own, together = self.own, self.together
+        of_A = own.diagonal.diagonal(dim1=-2, dim2=-1)
+        added_x = damping * of_A.clamp_min(DIAGONAL_FLOOR)
+        added_y = damping * self.diagonal.clamp_min(DIAGONAL_FLOOR)
+
+        def stepped(parts: Iterator[JourneySystem]) -> tuple[Tensor, Tensor] | None:
+            right_side = self.summed.factorise(added_y, parts)
+            if right_side is None:
+                return None
+            y = -self.summed.solve(right_side)
+            return y, -(right_side @ y)[None]
+
+        found = together.met(stepped, self._system(added_x))
+        if found is None:
+            return failed_step(own.unpack(own.eliminated_gradient, own.gradient), self.cost)
+        y, along_last = found
+        x = own.substitute(y, own.eliminated_gradient)
+        of_x = _along(x, own.eliminated_gradient, added_x)
+        of_y = _along(y, self.gradient, added_y)
+        along, damped, squared = together.sum(of_x + of_y if together.leads else of_x).split(1)
+        norm = squared.sqrt()
+        solved = norm.isfinite()
+        count = own.structure.where.used.sum(1).to(y)
+        return Step(
+            delta=own.unpack(x, y),
+            predicted=torch.where(solved, (damped - along) / 2, 0.0),
+            solved=solved,
+            norm=norm,
+            in_sigmas=(along_last / count.clamp_min(1)).clamp_min(0).sqrt(),
+        )
+
+    def _system(self, added_x: Float[Tensor, "e k"]) -> JourneySystem:
+        """One's own summand."""
+        return JourneySystem.of(self.own.reduce(added_x, None)[0])
+
+    @property
+    def tangent_gradient(self) -> dict[str, Tensor]:
+        """The gradient by variable, of all."""
+        return self.own.unpack(self.own.eliminated_gradient, self.gradient)
+
+    def correct(self, gradient: Tangents) -> dict[str, Tensor]:
+        """The step for another gradient, by the last factors."""
+        own = self.own
+        a, b = own.structure.stack(gradient), own.structure.where.pack(gradient)[0]
+
+        def stepped(parts: Iterator[Float[Tensor, " r"]]) -> Float[Tensor, " r"]:
+            right_side = b.clone()
+            for part in parts:
+                right_side -= part
+            return -self.summed.solve(right_side)
+
+        y = self.together.met(stepped, own.couple_all(own.solve_alone(a)))
+        return own.unpack(own.substitute(y, a), y)
+
+    def covariance(self, *, floor: float = UNOBSERVED_FLOOR) -> LandmarkCovariance:
+        """The joint covariance of all that stays: the leader's, while members `share_covariance`."""
+        self.share_covariance(floor=floor)
+        summed, factor = self.summed, self.summed.factor
+        assert factor is not None, "of the leader"
+        where, is_current = self.own.structure.where, lambda: summed.factor is factor
+        return LandmarkCovariance(where, factor, self.sums_of_chains, is_current)
+
+    def share_covariance(self, *, floor: float = UNOBSERVED_FLOOR) -> None:
+        """Brings one's own summand of what is undamped to the leader, which factors the sum."""
+        own = self.own
+        added = torch.zeros_like(self.gradient)
+        added[: own.structure.border_begin] = floor
+
+        def factored(parts: Iterator[JourneySystem]) -> bool:
+            return self.summed.factorise(added, parts) is not None
+
+        nothing = torch.zeros_like(own.eliminated_gradient)
+        if not self.together.met(factored, self._system(nothing)):
+            raise ValueError("the chains' blocks are not positive definite without damping")
+
+    def sums_of_chains(
+        self, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
+    ) -> tuple[Float[Tensor, "j m m"], WeightedSums] | None:
+        """`weighted_sums` of all chains, of which each brings those of its own; of a member nothing."""
+        factor = self.own.workspace.factor
+        assert factor is not None
+        chains = self.own.chains(factor.leads)
+        return self.together.for_leader(_all_sums, _own_sums(chains, weight, of, count))
+
+    def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
+        """Covariance of every block of one's own, the landmarks known."""
+        return self.own.conditional_covariance(name)
+
+    def variance_of_leaves(self) -> Float[Tensor, "l k"]:
+        """Variance of each own leaf's numbers less those of the block that carries it, landmarks and border known."""
+        return self.own.variance_of_leaves()
+
+    def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
+        """Variances of the changes between blocks of own chains, landmarks and border known."""
+        return self.own.variance_of_changes(changes)
+
+    def border_information(self) -> BorderInformation:
+        """Information on the border, everything else marginalised, as the last step had it; of a member nothing."""
+        summed = self.summed
+        if summed.factor is None or summed.added is None:
+            return BorderInformation(self.gradient.new_zeros(0, 0), {})
+        return border_information(self.own.structure, summed.factor, summed.added)
+
+
+def _along(step: Tensor, gradient: Tensor, added: Tensor) -> Float[Tensor, " 3"]:
+    """g.s, s.D s and s.s."""
+    return torch.stack(
+        [(gradient * step).sum(), (added * step.square()).sum(), step.square().sum()]
+    )
+
+
+def _own_sums(
+    chains: ChainBorder, weight: Tensor, of: Tensor, count: int
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+    own, sums = weighted_sums(chains, weight, of, count)
+    return own, (sums.row, sums.of, sums.value)
+
+
+def _all_sums(
+    parts: Iterator[tuple[Tensor, tuple[Tensor, Tensor, Tensor]]],
+) -> tuple[Tensor, WeightedSums]:
+    every = list(parts)
+    own = torch.stack([of for of, _ in every]).sum(0)
+    return own, WeightedSums(
+        *(torch.cat(each) for each in zip(*(sums for _, sums in every), strict=True))
+    )

@@ -1,0 +1,97 @@
+"""Adjustments that are shared out: convoys take the steps of the whole, wherever they are and whatever ends their hosts."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.config import AdjustConfig
+from crowdmap_torch.adjustment.convoys import Convoys, convoy
+from crowdmap_torch.adjustment.covariance import map_uncertainty
+from crowdmap_torch.adjustment.cuts import convoys
+from crowdmap_torch.fleet.choice import engine_of
+from crowdmap_torch.fleet.engine import Engine
+from crowdmap_torch.processes.together import ALONE
+from crowdmap_torch.processes.workers import Workers
+
+STEPS = 3
+
+
+def bundle_of(street, *, convoy_m: float) -> Bundle:
+    return street.bundle(config=replace(AdjustConfig(), convoy_m=convoy_m, cut_unknowns=60))
+
+
+def adjusted(street, *, convoy_m: float, engine: Engine | None = None) -> dict[str, Tensor]:
+    """All that an adjustment has after some steps, and covariances there."""
+    bundle = bundle_of(street, convoy_m=convoy_m)
+    taken = adjust.steps(bundle, adjust.start(bundle), engine=engine)
+    costs = [float(state.cost) for _, (_, state) in zip(range(STEPS), taken, strict=False)]
+    taken.close()
+    found = map_uncertainty(bundle, street.signs, street.lanes, engine)
+    own = {name: value for name, value in bundle.state_dict().items() if "delta" not in name}
+    told = {"center": found.center, "lanes": found.lane_sigma, "bias": found.bias_covariance}
+    return {**own, **told, "costs": torch.tensor(costs, dtype=torch.float64)}
+
+
+@pytest.fixture(scope="module")
+def shared_out(street) -> dict[str, Tensor]:
+    return adjusted(street, convoy_m=50.0)
+
+
+def test_convoys_come_to_where_all_drives_together_come(street, shared_out):
+    whole = adjusted(street, convoy_m=0.0)
+    assert len(bundle_of(street, convoy_m=50.0).convoys) > 1
+    for name, value in whole.items():
+        # Sums in another order: a step's matrix has a condition of up to 1e10.
+        close = torch.allclose(shared_out[name].double(), value.double(), rtol=1e-5, atol=1e-8)
+        assert close, name
+
+
+def test_a_host_that_is_killed_changes_nothing(street, shared_out, monkeypatch):
+    killed = []
+    start = Workers.start
+
+    def shot(self: Workers, key: object, call) -> None:
+        start(self, key, call)
+        if len(killed) < 2 and len(calls) in (20, 45):
+            killed.append(self._processes[-1].pid)
+            os.kill(killed[-1], signal.SIGKILL)
+        calls.append(call[0])
+
+    calls: list[str] = []
+    monkeypatch.setattr(Workers, "start", shot)
+    with engine_of("processes", workers=2) as engine:
+        found = adjusted(street, convoy_m=50.0, engine=engine)
+    assert len(killed) == 2
+    assert engine.spent.again == 2
+    assert all(torch.equal(found[name], value) for name, value in shared_out.items())
+
+
+def test_parts_of_a_bundle_cost_what_the_whole_costs(street):
+    bundle = bundle_of(street, convoy_m=50.0)
+    state = adjust.start(bundle)
+    with Convoys(bundle, state) as shared:
+        after, _ = shared.step()
+    assert set(after.values) == set(state.values)
+    assert all(after.values[name].shape == value.shape for name, value in state.values.items())
+    assert torch.equal(bundle.values()["sign"], after.values["sign"])
+    parts = [convoy(bundle, None, *of).bundle(ALONE) for of in bundle.convoys]
+    assert sum(len(part.corners) for part in parts) == len(bundle.corners)
+    assert sum(len(part.lane_points) for part in parts) == len(bundle.lane_points)
+
+
+def test_convoys_drive_about_as_much_each():
+    journey = torch.arange(6).repeat_interleave(2)
+    way = torch.tensor([0.0, 10.0]).repeat(6)
+    assert convoys(journey, way, 6, 25.0) == [(0, 3), (3, 6)]
+    assert convoys(journey, way, 6, 31.0) == [(0, 6)]
+    assert convoys(journey, way, 6, 0.0) == [(0, 6)]
+    # Where none may be parted, each is one.
+    assert convoys(journey, way, 6, 1.0) == [(n, n + 1) for n in range(6)]
