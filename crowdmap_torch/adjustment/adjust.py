@@ -8,7 +8,7 @@ all that the next ones follow from; a bundle that is built alike goes on from th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
@@ -40,7 +40,8 @@ from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.calibration import KnownCalibration
-from crowdmap_torch.noise.pose_prior import MOST_NUMBERS, DriftNodes, drift_nodes, pose_prior
+from crowdmap_torch.noise.drift_nodes import DriftNodes, drift_nodes
+from crowdmap_torch.noise.pose_prior import MOST_NUMBERS, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm
@@ -168,10 +169,11 @@ def adjust(bundle: Bundle) -> lm.LmState:
 
 def steps(
     bundle: Bundle, state: lm.LmState, *, first: int = 0, engine: Engine | None = None
-) -> Iterator[tuple[int, lm.LmState]]:
+) -> Generator[tuple[int, lm.LmState], None, None]:
     """Every step's number, from `first` on, and the state after it, until the adjustment is finished or out of steps.
 
-    Many drives are shared out to the hosts of an engine, in `convoys`; None: all of them are in this process.
+    Many drives are shared out to the hosts of an engine, in `convoys`, which end with these steps; None: all are in this
+    process.
     """
     numbers = range(first, bundle.config.lm.max_iterations)
     with ExitStack() as ends:

@@ -165,9 +165,9 @@ class Bundle(BundleState):
 
     def _of_journeys(self, own: Float[Tensor, "j k"]) -> Float[Tensor, "j k"]:
         """What there is of every journey, each told by whoever has it."""
-        if self.together.is_alone:
-            return own
-        return self.together.sum(torch.where(self._own[:, None], own, 0.0))
+        told, mine = torch.zeros_like(own), self.prior.journeys
+        told[mine] = own[mine]
+        return self.together.sum(told)
 
     def _rescale_noise(self, values: dict[str, Tensor], evidence: PoseEvidence) -> bool:
         """Finds the noise of poses from frame to frame; returns whether it has come to rest."""
@@ -203,8 +203,7 @@ class Bundle(BundleState):
                 assert isinstance(term.loss, JointTukey)
                 too_large = found.are_too_large(self.config.innovation_chance)
                 given_up[self.corners.detection] = too_large[term.loss.run]
-            if not self.together.is_alone:
-                given_up = self.together.sum(given_up.long()) > 0
+            given_up = self.together.sum(given_up.long()) > 0
         first, changed = int(self.judged) == 0, not torch.equal(given_up, self.given_up)
         self.judged += 1
         self.given_up.copy_(given_up)

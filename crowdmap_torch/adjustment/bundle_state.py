@@ -123,10 +123,6 @@ class BundleState(nn.Module):
         )
         self._by_mount = self.fleet.by_mount(values["pose"])
         self._detections = KeptDetections()
-        self._own = torch.ones_like(self.prior_scale[:, 0], dtype=torch.bool)
-        """Journeys that are its own."""
-        if shared_out is not None:
-            self._own = shared_out.own
         self._backend: ChainBackend | JourneyBackend | None = None
 
     @property

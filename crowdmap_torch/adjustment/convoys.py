@@ -11,11 +11,11 @@ bits on any engine with any number of workers.
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from types import TracebackType
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.adjustment.bias_sums import sums_of_bias
@@ -36,8 +36,8 @@ from crowdmap_torch.processes.together import Member, Together
 
 _OWN = ("pose", "drift")
 """The unknowns that each convoy has of its own drives alone."""
-_ROWS = ("match_t", "match_normal", "match_valid")
-"""What a bundle keeps of each lane point."""
+_ROWS = ("match_t", "match_normal", "match_valid", "poses_left")
+"""What a bundle keeps of each lane point, and of each pose."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,6 @@ class Convoy:
     priors: Priors
     config: AdjustConfig
     plan: EliminationPlan
-    own: Bool[Tensor, " j"]
-    """Which journeys they are."""
     kept: dict[str, Tensor]
     """What the bundle keeps beside its unknowns, by name."""
     state: LmState | None
@@ -58,13 +56,14 @@ class Convoy:
 
     def bundle(self, together: Together, whole: Bundle | None = None) -> Bundle:
         """Their bundle, which works with others `together`; with their leader's is the `whole`."""
-        shared_out = SharedOut(together, self.plan, self.own, len(self.kept["given_up"]))
+        shared_out = SharedOut(together, self.plan, len(self.kept["given_up"]))
         own = self.unknowns, self.observations, self.priors, self.config
         bundle = Bundle(*own, shared_out, whole)
         bundle.load_state_dict({**bundle.state_dict(), **self.kept})
         return bundle
 
 
+@torch.no_grad()
 def convoy(bundle: Bundle, state: LmState | None, first: int, last: int) -> Convoy:
     """The journeys of a bundle from the `first` to the one before the `last`, where its adjustment stands."""
     nodes, values = bundle.prior.nodes, bundle.values()
@@ -80,8 +79,8 @@ def convoy(bundle: Bundle, state: LmState | None, first: int, last: int) -> Conv
     beside = bundle.beside - of_poses.start
     is_here = (beside >= 0) & (bundle.beside < of_poses.stop)
     kept = {k: v for k, v in bundle.state_dict().items() if k not in bundle.unknown_names}
-    kept |= {name: kept[name][point] for name in _ROWS}
-    kept["poses_left"] = kept["poses_left"][of_poses]
+    rows = dict.fromkeys(_ROWS, point) | {"poses_left": of_poses}
+    kept |= {name: kept[name][of] for name, of in rows.items()}
 
     def of_all(name: str, value: Tensor) -> Tensor:
         return value[own[name]] if name in own else value
@@ -104,7 +103,6 @@ def convoy(bundle: Bundle, state: LmState | None, first: int, last: int) -> Conv
         ),
         config=bundle.config,
         plan=_plan(bundle, of_nodes, of_poses),
-        own=here,
         kept=kept,
         state=state
         and replace(
@@ -134,8 +132,8 @@ def _plan(bundle: Bundle, nodes: slice, poses: slice) -> EliminationPlan:
     room = plan.room
     if room is not None:
         # Keys count leaves, then nodes, each with all landmarks.
-        stays = sum(len(bundle.values()[name]) for name in bundle.names if name not in _OWN)
-        landmarks = stays - sum(len(bundle.values()[name]) for name in plan.border)
+        own = {*_OWN, *plan.border}
+        landmarks = sum(len(of) for name, of in bundle.values().items() if name not in own)
         block, landmark = room // landmarks, room % landmarks
         leaf, node = block - poses.start, block - plan.leaf_count - nodes.start
         is_leaf = (leaf >= 0) & (leaf < leaves) & (block < plan.leaf_count)
@@ -177,10 +175,11 @@ def drive_along(member: Member, own: Convoy) -> None:
             equations.sums_of_chains(*sums_of_bias(bundle))
 
 
+@torch.no_grad()
 def _moved(bundle: Bundle) -> tuple[Tensor, ...]:
     """What a step changes of what is a convoy's own."""
     values, kept = bundle.values(), bundle.state_dict()
-    return (*(values[name] for name in _OWN), *(kept[name] for name in _ROWS), bundle.poses_left)
+    return (*(values[name] for name in _OWN), *(kept[name] for name in _ROWS))
 
 
 @torch.no_grad()
@@ -194,18 +193,21 @@ def _equations(bundle: Bundle, prior_scale: Float[Tensor, "j _"]) -> JourneyEqua
 # ---- their leader ----
 
 
-class Convoys:
+class Convoys(ExitStack):
     """The convoys of a bundle on the hosts of an engine, a context manager that ends them; and their leader's part."""
 
     def __init__(self, bundle: Bundle, state: LmState | None, engine: Engine | None = None) -> None:
         """`bundle` stands where `state` does, and follows step by step; without one no step may be taken."""
+        super().__init__()
         self.bundle, self.state = bundle, state
         self._parts = bundle.convoys
         engine = InProcess() if engine is None else engine
-        self._company = Company(engine, len(self._parts), self._program, "bundle adjustment")
+        self._company = self.enter_context(
+            Company(engine, len(self._parts), self._program, "bundle adjustment")
+        )
         self._leader = self._company.leader
-        self._own = convoy(bundle, state, 0, 0).bundle(self._leader, bundle)
-        self._state = convoy(bundle, state, 0, 0).state
+        own = convoy(bundle, state, 0, 0)
+        self._own, self._state = own.bundle(self._leader, bundle), own.state
 
     def _program(self, number: int) -> Program:
         return drive_along, (convoy(self.bundle, self.state, *self._parts[number]),)
@@ -213,20 +215,12 @@ class Convoys:
     @torch.no_grad()
     def step(self) -> tuple[LmState, bool]:
         """`adjust_step` of the bundle."""
-        assert self._state is not None and self.state is not None
+        assert self._state is not None
         self._leader.tell(("step",))
         self._state, finished = adjust_step(self._own, self._state, self._own.backend())
         found = self._leader.for_leader(list, ())
-        moved = [part for part in found if part]
-        values = dict(self._state.values)
-        if moved:
-            every = [torch.cat(each) for each in zip(*moved, strict=True)]
-            values |= dict(zip(_OWN, every, strict=False))
-            self._follow(values, every[len(_OWN) :])
-        else:
-            values |= {name: self.state.values[name] for name in _OWN}
-        self.state = replace(self._state, values=values, normal=None)
-        self._company.renew()
+        self._company.renew(lambda: self._follow([part for part in found if part]))
+        assert self.state is not None
         return self.state, finished
 
     def covariance(
@@ -237,25 +231,18 @@ class Convoys:
         covariance = _equations(self._own, prior_scale).covariance()
         return covariance, covariance.of_sums(*sums_of_bias(self._own))
 
-    def _follow(self, values: dict[str, Tensor], rows: list[Tensor]) -> None:
-        """Has the bundle where the convoys are."""
-        bundle, own = self.bundle, self._own.state_dict()
-        moved = {*_ROWS, "poses_left", *bundle.unknown_names}
-        kept = {name: of for name, of in own.items() if name not in moved}
-        kept |= dict(zip((*_ROWS, "poses_left"), rows, strict=True))
-        for name, of in kept.items():
-            getattr(bundle, name).copy_(of)
-        bundle.fold(values)
-        bundle.relinearise()
-
-    def __enter__(self) -> Convoys:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Ends the convoys."""
-        self._company.__exit__(kind, error, traceback)
+    def _follow(self, moved: list[tuple[Tensor, ...]]) -> None:
+        """Has the bundle where the convoys are; `moved` is what each has of its own, nothing where no step was taken."""
+        assert self._state is not None and self.state is not None
+        bundle, values = self.bundle, dict(self._state.values)
+        values |= {name: self.state.values[name] for name in _OWN}
+        if moved:
+            every = [torch.cat(each) for each in zip(*moved, strict=True)]
+            found = dict(zip((*_OWN, *_ROWS), every, strict=True))
+            values |= {name: found[name] for name in _OWN}
+            kept = {**self._own.state_dict(), **found}
+            for name in kept.keys() - bundle.unknown_names - {*_OWN}:
+                getattr(bundle, name).copy_(kept[name])
+            bundle.fold(values)
+            bundle.relinearise()
+        self.state = replace(self._state, values=values, normal=None)

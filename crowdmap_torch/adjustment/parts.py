@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.calibration import Fleet
@@ -92,7 +92,5 @@ class SharedOut:
     together: Together
     plan: EliminationPlan
     """What is eliminated of them, and how; landmarks are ranked as in all drives' plan."""
-    own: Bool[Tensor, " j"]
-    """Which journeys they are."""
     detections: int
     """How many numbers detections have, everybody's."""

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from crowdmap_torch.fleet.engine import Engine, Finished, finished
+from crowdmap_torch.processes.memory import keep_in_one_place
 from crowdmap_torch.processes.workers import Call, Workers
 
 
@@ -58,7 +59,7 @@ class _Beside:
     """One process; another one takes its place where it was killed."""
 
     def __init__(self) -> None:
-        self._pool = Workers(1, torch.set_num_threads, 1)
+        self._pool = Workers(1, _in_one_place)
 
     def start(self, call: Call) -> None:
         """Hands it to the process."""
@@ -72,3 +73,9 @@ class _Beside:
     def end(self) -> None:
         """Ends the process."""
         self._pool.__exit__(None, None, None)
+
+
+def _in_one_place() -> None:
+    """What a host does first: its members' threads share one core and what they free."""
+    torch.set_num_threads(1)
+    keep_in_one_place()

@@ -9,12 +9,11 @@ from __future__ import annotations
 import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from itertools import count
-from types import TracebackType
 from typing import Any
 
 from crowdmap_torch.fleet.engine import ATTEMPTS, Engine, Finished, Host, finished
-from crowdmap_torch.processes.memory import keep_in_one_place
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.processes.together import Leader, Member
 from crowdmap_torch.processes.workers import Call, WorkerLost
@@ -25,19 +24,24 @@ _LOG = logging.getLogger(__name__)
 _NUMBERS = count()
 
 
-class Company:
+class Company(ExitStack):
     """The members, a context manager that ends them; `leader` meets them."""
 
     def __init__(
         self, engine: Engine, members: int, begin: Callable[[int], Program], name: str
     ) -> None:
         """`begin` is what a member does from its beginning, or from the last `renew` on; `name` is that of their work."""
+        super().__init__()
         self.leader = Leader(self)
         self._engine, self._begin, self._name = engine, begin, name
         hosts = min(members, max(engine.most_hosts, 1))
         self._hosts: list[Host] = [engine.host() for _ in range(hosts)]
+        for host in self._hosts:
+            self.callback(host.end)
         self._members = members
         self._key = next(_NUMBERS)
+        if engine.shares_memory:
+            self.callback(_end, self._key)
         self._told: list[Any] = []
         """What all members were told since their beginning."""
         self._is_there = [False] * members
@@ -61,27 +65,14 @@ class Company:
         self._told.append(reply)
         self._tell_all()
 
-    def renew(self) -> None:
-        """From now on members that are lost begin as `begin` has it now; all must wait to be told something next."""
+    def renew(self, change: Callable[[], object]) -> None:
+        """From `change` on members that are lost begin as `begin` has it then; all must wait to be told something next."""
+        # Until all of them are there, one that is lost begins where it began.
         for number in range(self._members):
             self._brought[number] = self._next(number)
+        change()
         self._told.clear()
         self._lost.clear()
-
-    def __enter__(self) -> Company:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Ends the members, wherever they are."""
-        if self._engine.shares_memory:
-            _end(self._key)
-        for host in self._hosts:
-            host.end()
 
     def _tell_all(self) -> None:
         for host in range(len(self._hosts)):
@@ -147,7 +138,6 @@ def _begin(
     key: int, number: int, program: Callable[..., object], arguments: tuple, told: list[Any]
 ) -> tuple[str, Any]:
     """Begins a member and tells it what it was told before; the meeting that it comes to."""
-    keep_in_one_place()
     member = _MEMBERS[key, number] = Member(program, *arguments)
     brought = member.begin()
     for reply in told:

@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from crowdmap_torch.processes.memory import peak_bytes
 from crowdmap_torch.processes.workers import Call, WorkerLost
@@ -47,6 +47,7 @@ class Finished:
     """The most that the process has held by now."""
 
 
+@runtime_checkable
 class Host(Protocol):
     """A worker of its own: calls find what those before them left behind in its modules."""
 

@@ -12,7 +12,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from types import TracebackType
@@ -23,6 +23,7 @@ import torch
 from crowdmap_torch import __version__
 from crowdmap_torch.fleet.engine import Engine, Finished, finished
 from crowdmap_torch.processes.interrupts import loading
+from crowdmap_torch.processes.memory import keep_in_one_place
 from crowdmap_torch.processes.workers import Call, WorkerLost, answer, taken
 
 _LOOK_S = 0.2
@@ -73,17 +74,12 @@ class OnRay(Engine):
 
     def gather(self) -> list[tuple[int, Finished]]:
         """Waits for Ray."""
-        done: list[Any] = []
-        while not done:
-            done, _ = self._ray.wait([*self._running], num_returns=1, timeout=_LOOK_S)
-        (reference,) = done
+        reference = _first_done(self._ray, [*self._running])
         number = self._running.pop(reference)
         try:
             reply = _answer_of(self._ray, reference)
         except self._ray.exceptions.RayError as error:
-            kind = type(error).__name__
-            text = f"{self._names[number]}: its worker on Ray was lost ({kind})"
-            raise WorkerLost(number, text) from None
+            raise _lost(number, self._names[number], error) from None
         return [(number, taken(reply))]
 
     def __enter__(self) -> OnRay:
@@ -149,15 +145,11 @@ class _Actor:
 
     def wait(self) -> Any:
         """Waits for Ray."""
-        done: list[Any] = []
-        while not done:
-            done, _ = self._ray.wait([self._running], num_returns=1, timeout=_LOOK_S)
         try:
-            reply = _answer_of(self._ray, done[0])
+            reply = _answer_of(self._ray, _first_done(self._ray, [self._running]))
         except self._ray.exceptions.RayError as error:
             self._actor = None
-            kind = type(error).__name__
-            raise WorkerLost(0, f"{self._name}: its worker on Ray was lost ({kind})") from None
+            raise _lost(0, self._name, error) from None
         return taken(reply)
 
     def end(self) -> None:
@@ -169,9 +161,25 @@ class _Actor:
 class _Worker:
     """What an actor does."""
 
+    def __init__(self) -> None:
+        # Before its members' threads begin.
+        keep_in_one_place()
+
     def work(self, message: bytes, asked: tuple[str, ...]) -> bytes:
         """Does a task."""
         return _work(message, asked)
+
+
+def _first_done(ray: Any, references: Sequence[Any]) -> Any:
+    """The first of some tasks that is finished, or lost."""
+    done: list[Any] = []
+    while not done:
+        done, _ = ray.wait([*references], num_returns=1, timeout=_LOOK_S)
+    return done[0]
+
+
+def _lost(number: int, name: str, error: Exception) -> WorkerLost:
+    return WorkerLost(number, f"{name}: its worker on Ray was lost ({type(error).__name__})")
 
 
 def _answer_of(ray: Any, reference: Any) -> bytes:

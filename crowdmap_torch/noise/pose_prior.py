@@ -25,6 +25,7 @@ from crowdmap_torch.noise.bias_wander import (
     nodes_apart,
     wandering_drives,
 )
+from crowdmap_torch.noise.drift_nodes import DriftNodes, begins_of
 from crowdmap_torch.noise.pooled_scales import pooled
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.noise.stated_sigmas import sigmas_of
@@ -52,37 +53,6 @@ class PosePriorConfig(Settings):
     """Degrees of freedom that the sigmas as they are given count in the fleet's scale."""
     scale_lag_m: Length = 100.0
     """Way over which the drift's changes are compared with their sigma."""
-
-
-@dataclass(frozen=True)
-class DriftNodes:
-    """Stretches of road with one drift each: the blocks that form a journey's chain."""
-
-    of_frame: Int[Tensor, " p"]
-    """Node of each pose of the bundle."""
-    first: Int[Tensor, " n"]
-    """First pose of each node."""
-    journey: Int[Tensor, " n"]
-    way: Float[Tensor, " n"]
-    """Distance travelled at the node [m]."""
-
-    def mean(self, at_nodes: Float[Tensor, "n k"], journeys: int) -> Float[Tensor, "j k"]:
-        """The mean over each journey's nodes; zero where it has none."""
-        count = torch.bincount(self.journey, minlength=journeys).clamp_min(1)
-        total = at_nodes.new_zeros(journeys, at_nodes.shape[1])
-        return total.index_add_(0, self.journey, at_nodes) / count[:, None]
-
-
-def drift_nodes(journey: Int[Tensor, " n"], way: Float[Tensor, " n"], spacing: float) -> DriftNodes:
-    """Stretches of at most `spacing` metres in which the drift is taken to stand still."""
-    cell = (way / spacing).floor()
-    begins = _begins(journey)
-    begins[1:] |= cell[1:] != cell[:-1]
-    of_frame = begins.cumsum(0) - 1
-    first = torch.nonzero(begins)[:, 0]
-    count = torch.bincount(of_frame, minlength=len(first))
-    centre = way.new_zeros(len(first)).index_add_(0, of_frame, way) / count
-    return DriftNodes(of_frame, first, journey[first], centre)
 
 
 @dataclass(frozen=True)
@@ -147,6 +117,11 @@ class PosePrior:
         )
 
     @property
+    def journeys(self) -> Int[Tensor, " j"]:
+        """Those that it is of, by number."""
+        return self.slots["pose_bias"][0][1]
+
+    @property
     def scale_count(self) -> int:
         """Scales of each journey: of its bias, of its drift, of its rotation, and of its wander where there is one."""
         return 3 if self.wander is None else 4
@@ -166,14 +141,14 @@ class PosePrior:
     @property
     def chain(self) -> Int[Tensor, " n"]:
         """The stretch between two cuts, or of a whole journey, that each node is of."""
-        begins = _begins(self.nodes.journey)
+        begins = begins_of(self.nodes.journey)
         begins[self.cut] = True
         return begins.cumsum(0) - 1
 
     @property
     def journey_of_chain(self) -> Int[Tensor, " chains"]:
         """The journey of each such stretch."""
-        begins = _begins(self.nodes.journey)
+        begins = begins_of(self.nodes.journey)
         begins[self.cut] = True
         return self.nodes.journey[begins]
 
@@ -203,7 +178,7 @@ class PosePrior:
         """Absolute and relative regularisation of the poses, the sigmas scaled."""
         nodes = self.nodes
         bias, drift = self._scaled(scale)
-        bias = bias[self.slots["pose_bias"][0][1]]
+        bias = bias[self.journeys]
         noise = self.white_sigma * white_scale.repeat_interleave(3, dim=1)
         white = (noise.square() + self.within_stretch(scale)).sqrt()
         journey = nodes.journey
@@ -392,7 +367,7 @@ def pose_prior(
     )
     length = pose.new_tensor([positioning.drift_length_m] * 3 + [positioning.rotation_length_m] * 3)
     white = pose.new_tensor([positioning.white_sigma_m] * 3 + [positioning.white_sigma_rad] * 3)
-    begins = torch.nonzero(_begins(nodes.journey))[:, 0]
+    begins = torch.nonzero(begins_of(nodes.journey))[:, 0]
     cut = begins[:0] if cut is None else cut
     follows = nodes.journey[1:] == nodes.journey[:-1]
     follows[cut - 1] = False
@@ -440,10 +415,3 @@ def _slots(
         ),
         "pose_white": (("pose", frame), ("drift", nodes.of_frame)),
     }
-
-
-def _begins(journey: Int[Tensor, " n"]) -> Tensor:
-    """True for the first row of each journey."""
-    begins = torch.ones_like(journey, dtype=torch.bool)
-    begins[1:] = journey[1:] != journey[:-1]
-    return begins

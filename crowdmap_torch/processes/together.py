@@ -12,7 +12,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -52,10 +52,6 @@ class Together(ABC):
 
         return self.met(of, own)
 
-    def any(self, own: bool) -> bool:
-        """Whether it is true of any."""
-        return self.met(any, own)
-
 
 class _Alone(Together):
     """Nobody else is there."""
@@ -79,6 +75,7 @@ class _Alone(Together):
 ALONE = _Alone()
 
 
+@runtime_checkable
 class Meetings(Protocol):
     """Where a leader meets its members."""
 

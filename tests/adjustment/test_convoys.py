@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
@@ -16,7 +17,9 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.convoys import Convoys, convoy
 from crowdmap_torch.adjustment.covariance import map_uncertainty
 from crowdmap_torch.adjustment.cuts import convoys
+from crowdmap_torch.fleet.beside import _Beside
 from crowdmap_torch.fleet.choice import engine_of
+from crowdmap_torch.fleet.company import Company
 from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.processes.together import ALONE
 from crowdmap_torch.processes.workers import Workers
@@ -72,6 +75,44 @@ def test_a_host_that_is_killed_changes_nothing(street, shared_out, monkeypatch):
     assert len(killed) == 2
     assert engine.spent.again == 2
     assert all(torch.equal(found[name], value) for name, value in shared_out.items())
+
+
+def test_a_host_that_is_killed_at_the_end_of_a_step_begins_where_the_step_began(
+    street, shared_out, monkeypatch
+):
+    renew, killed = Company.renew, []
+
+    def shot(self: Company, change) -> None:
+        if not killed:
+            # None of its members has come to the end yet, and the bundle is where the step began.
+            (beside,) = self._hosts
+            assert isinstance(beside, _Beside)
+            host = beside._pool._processes[-1]
+            os.kill(host.pid, signal.SIGSTOP)
+            os.kill(host.pid, signal.SIGKILL)
+            host.wait()
+            killed.append(host.pid)
+        renew(self, change)
+
+    monkeypatch.setattr(Company, "renew", shot)
+    with engine_of("processes", workers=1) as engine:
+        found = adjusted(street, convoy_m=50.0, engine=engine)
+    assert engine.spent.again == 1
+    assert all(torch.equal(found[name], value) for name, value in shared_out.items())
+
+
+def test_an_adjustment_in_convoys_goes_on_where_it_was_interrupted(street, shared_out):
+    whole, other = (bundle_of(street, convoy_m=50.0) for _ in range(2))
+    taken = adjust.steps(whole, adjust.start(whole))
+    number, state = next(taken)
+    there = deepcopy(adjust.standing(whole, state, number + 1))
+    taken.close()
+    costs = [float(state.cost)]
+    on = adjust.steps(other, adjust.go_on(other, there), first=there.steps)
+    costs += [float(state.cost) for _, (_, state) in zip(range(STEPS - 1), on, strict=False)]
+    on.close()
+    assert costs == shared_out["costs"].tolist()
+    assert torch.equal(other.values()["sign"], shared_out["base_sign"])
 
 
 def test_parts_of_a_bundle_cost_what_the_whole_costs(street):

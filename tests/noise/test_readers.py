@@ -17,7 +17,8 @@ from crowdmap_torch.crowd_lanes.lateral_offsets import LateralOffsetConfig, jour
 from crowdmap_torch.crowd_lanes.samples import sample_lanes
 from crowdmap_torch.crowd_lanes.splines import curves_of, match
 from crowdmap_torch.crowd_signs.align import AlignConfig, align_journeys, no_bias
-from crowdmap_torch.noise.pose_prior import PosePriorConfig, drift_nodes, pose_prior
+from crowdmap_torch.noise.drift_nodes import drift_nodes
+from crowdmap_torch.noise.pose_prior import PosePriorConfig, pose_prior
 from crowdmap_torch.noise.positioning import DriftPathConfig, PositioningNoise, drift_terms
 from crowdmap_torch.road.estimate import RoadConfig, estimate_road
 from crowdmap_torch.road.nonholonomic import NonholonomicConfig, drive_path

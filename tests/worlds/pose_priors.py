@@ -8,7 +8,8 @@ from dataclasses import replace
 import torch
 from worlds.small_world import Builder
 
-from crowdmap_torch.noise.pose_prior import DriftNodes, PosePrior, PosePriorConfig, pose_prior
+from crowdmap_torch.noise.drift_nodes import DriftNodes
+from crowdmap_torch.noise.pose_prior import PosePrior, PosePriorConfig, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 
 F64 = torch.float64

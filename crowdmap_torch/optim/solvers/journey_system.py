@@ -93,11 +93,10 @@ class JourneyBackend:
     plan: EliminationPlan
     together: Together
     _chains: ChainBackend = field(init=False, repr=False)
-    _sum: TileMatrix | None = field(default=None, init=False, repr=False)
-    """Of the leader: memory for the sum."""
+    _summed: Summed = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._chains = ChainBackend(self.plan)
+        self._chains, self._summed = ChainBackend(self.plan), Summed()
 
     def assemble(self, problem: Problem, values: Values) -> JourneyEquations:
         """Normal equations at `values`, of which the last may be solved."""
@@ -108,40 +107,43 @@ class JourneyBackend:
             {"gradient": own.gradient, "diagonal": own.hessian.diagonal()},
         )
         present = own.structure.reduced.present
-        self.together.met(partial(self._make_room, own), torch.nonzero(present).to(torch.int32))
+        tiles = torch.nonzero(present).to(torch.int32)
+        self.together.for_leader(partial(self._summed.make_room, own), tiles)
         return JourneyEquations(
             *(costs.total, costs.by_term, own, self.together),
             *(total["gradient"], total["diagonal"]),
-            Summed(self._sum),
+            self._summed,
         )
 
-    def _make_room(self, own: ChainNormalEquations, tiles: Iterator[Int[Tensor, "n 2"]]) -> None:
+
+@dataclass
+class Summed:
+    """The sum of all systems, of the last normal equations: the leader's; a member's is empty."""
+
+    system: TileMatrix | None = None
+    factor: TiledCholesky | None = None
+    added: Float[Tensor, " r"] | None = None
+    """To the diagonal of C."""
+
+    def make_room(self, own: ChainNormalEquations, tiles: Iterator[Int[Tensor, "n 2"]]) -> None:
         """Memory for the sum of systems with these tiles, unless it is there already."""
+        # The last factors are in the same memory.
+        self.factor = None
         pattern = own.structure.reduced
         present = torch.zeros_like(pattern.present)
         for tile in tiles:
             row, column = tile.long().unbind(1)
             present[row, column] = True
-        if self._sum is not None and (
-            present.shape == self._sum.pattern.present.shape
-            and not bool((present & ~self._sum.pattern.present).any())
+        if self.system is not None and (
+            present.shape == self.system.pattern.present.shape
+            and not bool((present & ~self.system.pattern.present).any())
         ):
             return
         # The old one goes before the new one comes.
-        self._sum = None
+        self.system = None
         device = present.device
         whole = TilePattern.of(pattern.dim, pattern.width, present.cpu().numpy(), device).filled()
-        self._sum = TileMatrix.zeros(whole, own.gradient)
-
-
-@dataclass
-class Summed:
-    """The sum of all systems: the leader's."""
-
-    system: TileMatrix | None
-    factor: TiledCholesky | None = None
-    added: Float[Tensor, " r"] | None = None
-    """To the diagonal of C."""
+        self.system = TileMatrix.zeros(whole, own.gradient)
 
     def factorise(
         self, added: Float[Tensor, " r"], parts: Iterator[JourneySystem]
