@@ -122,7 +122,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--engine",
         choices=ENGINES,
-        help="where journeys are mapped: in this process, in processes beside it (default), on Ray",
+        help="where drives are mapped: in this process, in processes beside it (default), on Ray",
     )
     parser.add_argument(
         "--address",
