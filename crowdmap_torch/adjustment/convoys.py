@@ -123,7 +123,7 @@ def _of_poses(fleet: Fleet, poses: slice) -> Fleet:
 
 
 def _plan(bundle: Bundle, nodes: slice, poses: slice) -> EliminationPlan:
-    """What is eliminated of some poses and nodes; a leader has none, and is the one that factors."""
+    """What is eliminated of some poses and nodes; a leader has none."""
     plan = bundle.plan
     assert plan.carrier is not None and plan.joint is not None
     chain = plan.chain[nodes]
@@ -151,16 +151,19 @@ def _plan(bundle: Bundle, nodes: slice, poses: slice) -> EliminationPlan:
         joint=plan.joint[first:end],
         room=room,
         part=part,
-        is_whole=not count,
+        is_whole=False,
     )
 
 
 # ---- the program of a convoy ----
 
 
-def drive_along(member: Member, own: Convoy) -> None:
+def drive_along(member: Member) -> None:
     """What a convoy does: steps in time with the others, and its part of covariances, until it is ended."""
+    own: Convoy = member.take()
     bundle, state = own.bundle(member), own.state
+    # The bundle has all that is worth keeping.
+    del own
     while True:
         asked, *of = member.told()
         if asked == "step":
@@ -210,7 +213,7 @@ class Convoys(ExitStack):
         self._own, self._state = own.bundle(self._leader, bundle), own.state
 
     def _program(self, number: int) -> Program:
-        return drive_along, (convoy(self.bundle, self.state, *self._parts[number]),)
+        return drive_along, convoy(self.bundle, self.state, *self._parts[number])
 
     @torch.no_grad()
     def step(self) -> tuple[LmState, bool]:

@@ -18,8 +18,8 @@ from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.processes.together import Leader, Member
 from crowdmap_torch.processes.workers import Call, WorkerLost
 
-Program = tuple[Callable[..., object], tuple]
-"""What a member does: a function of a module, which is called with the member, and its further arguments."""
+Program = tuple[Callable[[Member], object], Any]
+"""What a member does: a function of a module, which is called with the member, and what it is given."""
 _LOG = logging.getLogger(__name__)
 _NUMBERS = count()
 
@@ -135,10 +135,10 @@ _MEMBERS: dict[tuple[int, int], Member] = {}
 
 @one_core_each()
 def _begin(
-    key: int, number: int, program: Callable[..., object], arguments: tuple, told: list[Any]
+    key: int, number: int, program: Callable[[Member], object], given: Any, told: list[Any]
 ) -> tuple[str, Any]:
     """Begins a member and tells it what it was told before; the meeting that it comes to."""
-    member = _MEMBERS[key, number] = Member(program, *arguments)
+    member = _MEMBERS[key, number] = Member(program, given)
     brought = member.begin()
     for reply in told:
         brought = member.reply(reply)

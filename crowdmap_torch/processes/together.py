@@ -130,12 +130,13 @@ class Member(Together):
     that and what it brings.
     """
 
-    def __init__(self, program: Callable[..., object], *arguments: object) -> None:
-        """`program` is called with the member and the arguments; it is to wait for its end by `told`."""
+    def __init__(self, program: Callable[[Member], object], given: Any) -> None:
+        """`program` is called with the member, may `take` what it is given, and is to wait for its end by `told`."""
+        self._given = [given]
         self._replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._brought: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._thread = threading.Thread(
-            target=self._run, args=(program, *arguments), daemon=True, name="member"
+            target=self._run, args=(program,), daemon=True, name="member"
         )
 
     # ---- for the process that runs it ----
@@ -166,6 +167,10 @@ class Member(Together):
         """Brings what one has."""
         self._meet("met", compact(own))
 
+    def take(self) -> Any:
+        """What the program is given, handed over once: nobody else keeps it."""
+        return self._given.pop()
+
     def told(self) -> Any:
         """What the leader tells all members next."""
         return self._meet("told", None)
@@ -177,11 +182,10 @@ class Member(Together):
             raise _Ended
         return reply
 
-    def _run(self, program: Callable[..., object], *arguments: object) -> None:
+    def _run(self, program: Callable[[Member], object]) -> None:
         torch.set_num_threads(1)
-        outcome = _Outcome(self._brought)
-        with outcome:
-            program(self, *arguments)
+        with _Outcome(self._brought):
+            program(self)
 
     def _next(self) -> tuple[str, Any]:
         what, own = self._brought.get()

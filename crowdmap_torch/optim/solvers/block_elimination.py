@@ -145,6 +145,7 @@ class Products:
     """Products that wait to be subtracted from the reduced system: by rows of tiles, each on one core, in order."""
 
     def __init__(self, system: TileMatrix) -> None:
+        self.system = system
         self._tiles, self._right_side = system.tiles, system.right_side[None]
         self._waiting: dict[int, list[tuple[Product, Tensor]]] = {}
         self._held = 0

@@ -57,6 +57,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.optim.solvers.windows import Batch, Round
 from crowdmap_torch.processes.threads import in_order
@@ -126,7 +127,7 @@ class ChainBackend:
                 k = problem.variables[self.plan.chains].tangent_dim
                 # The old one goes before the new one comes.
                 self._workspace = None
-                self._workspace = Workspace.of(self._structure, block, k)
+                self._workspace = Workspace(self._structure, block.new_empty(0, k))
             self._pattern = SparsityPattern.of(problem, values)
         assert self._structure is not None and self._workspace is not None
         return self._structure, self._workspace
@@ -134,27 +135,37 @@ class ChainBackend:
 
 @dataclass
 class Workspace:
-    """What the solves of one back end share: memory is taken once."""
+    """What the solves of one back end share; memory is taken once, by parts of a sum each time: others need it meanwhile."""
 
-    system: TileMatrix
-    """The reduced system."""
-    store: Float[Tensor, "rows k"]
-    """Per eliminated block and column of its window a row of `k`, by when it is eliminated; part after part in the same."""
+    structure: ChainStructure = field(repr=False)
+    like: Float[Tensor, "0 k"] = field(repr=False)
+    """Nothing, as wide as eliminated blocks, with the device and the type of all."""
     couplings: dict[str, Float[Tensor, "f w _"]] = field(default_factory=dict)
     """Of the last normal equations, by term."""
     factor: Factor | None = None
     """Of the last solve."""
+    _kept: tuple[TileMatrix, Tensor] | None = field(default=None, repr=False)
 
-    @classmethod
-    def of(cls, structure: ChainStructure, like: Tensor, k: int) -> Workspace:
-        """Memory for eliminated blocks of `k` unknowns, with the device and the type of `like`."""
-        store = like.new_empty(structure.store_rows + 1, k)
-        return cls(TileMatrix.zeros(structure.reduced, like), store)
+    def room(self) -> tuple[TileMatrix, Float[Tensor, "rows k"]]:
+        """Zeros for the reduced system, and a store, whatever is in it.
+
+        The store has, per eliminated block and column of its window, a row of `k`, by when it is eliminated; part after part
+        in the same.
+        """
+        if self._kept is not None:
+            self._kept[0].flat.zero_()
+            return self._kept
+        structure, like = self.structure, self.like
+        system = TileMatrix.zeros(structure.reduced, like)
+        found = system, like.new_empty(structure.store_rows + 1, like.shape[1])
+        if structure.plan.is_whole:
+            self._kept = found
+        return found
 
     def coupling(self, name: str, shape: tuple[int, ...]) -> Float[Tensor, "f w _"]:
         """Memory for a term's coupling; what is in it is of no account."""
         if name not in self.couplings or self.couplings[name].shape != shape:
-            self.couplings[name] = self.store.new_empty(shape)
+            self.couplings[name] = self.like.new_empty(shape)
         return self.couplings[name]
 
 
@@ -189,7 +200,7 @@ class ChainNormalEquations:
     """Blocks of B by term, as wide as the eliminated variable."""
     border_link: Float[Tensor, "e k b"]
     """Blocks of F: each eliminated block with its chain's blocks of the border's variables, one behind the other."""
-    hessian: TileMatrix
+    hessian: StayingBlocks
     gradient: Float[Tensor, " r"]
     workspace: Workspace = field(repr=False)
 
@@ -297,13 +308,13 @@ class ChainNormalEquations:
 
         The arguments are added to the diagonals of A and C.
         """
-        structure, system = self.structure, self.workspace.system
-        system.copy_from(self.hessian, structure.direct_tiles)
+        structure, (system, store) = self.structure, self.workspace.room()
+        self.hessian.add_to(system)
         system.right_side.copy_(self.gradient)
         if added_y is not None:
             system.add_diagonal(added_y)
         products = Products(system)
-        leads = tuple(self._eliminate(part, added_x, products) for part in structure.parts)
+        leads = tuple(self._eliminate(part, added_x, products, store) for part in structure.parts)
         products.subtract()
         self.chains(leads).add(system, self.eliminated_gradient)
         is_undamped = not bool(
@@ -315,11 +326,15 @@ class ChainNormalEquations:
         return system, factor
 
     def _eliminate(
-        self, part: Part, added: Float[Tensor, "e k"], products: Products
+        self,
+        part: Part,
+        added: Float[Tensor, "e k"],
+        products: Products,
+        store: Float[Tensor, "rows k"],
     ) -> tuple[Lead, ...]:
         """Takes a part's chains off the reduced system, round by round, and hands back what the rounds leave behind."""
-        structure, system = self.structure, self.workspace.system
-        store = self._filled_store(part)
+        structure, system = self.structure, products.system
+        store = self._filled(store[: part.store_rows + 1], part)
         diagonal, link = part.by_place(self.diagonal, self.link, added)
         leads = []
         for of_round in part.rounds:
@@ -341,9 +356,9 @@ class ChainNormalEquations:
                     products.add(batch.products, found.wide)
         return tuple(leads)
 
-    def _filled_store(self, part: Part) -> Float[Tensor, "rows k"]:
-        """The store with a part's couplings and gradient."""
-        store = self.workspace.store[: part.store_rows + 1].zero_()
+    def _filled(self, store: Float[Tensor, "rows k"], part: Part) -> Float[Tensor, "rows k"]:
+        """A store with a part's couplings and gradient, in place."""
+        store.zero_()
         for name, own in part.factors.items():
             rows, block = part.factor_rows[name], self.coupling[name][own].flatten(0, 1)
             narrow = store[:, : block.shape[1]]

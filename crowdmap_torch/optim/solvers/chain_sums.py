@@ -12,7 +12,7 @@ from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, pairs
 from crowdmap_torch.optim.solvers.couplings import TermFactors
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, padded
-from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.optim.solvers.staying_blocks import Between, StayingBlocks
 
 
 class ChainSums:
@@ -96,7 +96,7 @@ class ReducibleSums(ChainSums):
         """`coupling` is memory for B, by term, as wide as its eliminated block; what is in it is of no account."""
         super().__init__(structure, problem, values)
         self.coupling = coupling
-        self._matrix = TileMatrix.zeros(structure.direct, values[structure.plan.chains])
+        self._between: list[Between] = []
         self._lots: dict[tuple[str, int, int], Tensor] = {}
         """By term and two of its slots that stay, their blocks by lot."""
         for blocks in coupling.values():
@@ -135,8 +135,7 @@ class ReducibleSums(ChainSums):
         """Adds the blocks between two variables that stay."""
         where, (name, block), (name_of_other, block_of_other) = self.structure.where, one, other
         row, column = where.offset[name][block], where.offset[name_of_other][block_of_other]
-        self._matrix.add(row, column, square)
-        self._matrix.add(column, row, square.transpose(0, 1))
+        self._between.append(Between(row, column, square).joined())
 
     def add_lots(self) -> None:
         """Adds what was summed by lot, once all rows are there."""
@@ -145,18 +144,12 @@ class ReducibleSums(ChainSums):
             self._add_between(slots[i], slots[j], square)
         self._lots = {}
 
-    def hessian_of_stays(self) -> TileMatrix:
+    def hessian_of_stays(self) -> StayingBlocks:
         """The matrix C."""
         where = self.structure.where
-        for name, offset in where.offset.items():
-            square = self.by_variable.hessian(name).permute(1, 2, 0)
-            self._matrix.add(offset, offset, square)
-        if not self.structure.plan.is_whole:
-            return self._matrix
-        # What is nobody's column stands for itself.
-        gap = torch.nonzero(~where.used[0])[:, 0]
-        self._matrix.add(gap, gap, self._matrix.flat.new_ones(1, 1, len(gap)))
-        return self._matrix
+        own = {name: self.by_variable.hessian(name) for name in where.offset}
+        # Of a sum's parts none has what is nobody's column: the sum has it once.
+        return StayingBlocks(where, own, tuple(self._between), self.structure.plan.is_whole)
 
     def gradient_of_stays(self) -> Float[Tensor, " r"]:
         """The gradient b."""

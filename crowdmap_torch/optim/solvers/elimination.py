@@ -63,8 +63,6 @@ class ChainStructure:
     """Tiles of C."""
     reduced: TilePattern
     """Tiles of S and of its factor."""
-    direct_tiles: Int[Tensor, " count"]
-    """The numbers of C's tiles among those of S."""
     owner: Int[Tensor, " e"]
     """Chain that each block belongs to, counted over leaves and chains."""
     border: Int[Tensor, "chains b"]
@@ -183,7 +181,6 @@ def analyse(
         number=number,
         direct=direct,
         reduced=reduced,
-        direct_tiles=reduced.numbers_of(direct),
         owner=owner,
         border=torch.cat(none + [where.entries(*of) for of in plan.border.items()], dim=1),
         keys=keys,

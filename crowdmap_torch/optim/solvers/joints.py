@@ -27,7 +27,7 @@ from crowdmap_torch.optim.solvers.block_elimination import Lead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
-from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
 from crowdmap_torch.processes.threads import in_order
 
 
@@ -124,7 +124,7 @@ class Joints:
 def joints_of(
     structure: ChainStructure,
     coupling: Mapping[str, Float[Tensor, "f w _"]],
-    hessian: TileMatrix,
+    hessian: StayingBlocks,
     leads: Sequence[Sequence[Lead]],
 ) -> Joints | None:
     """Those of equations with B `coupling` and C `hessian`, by what rounds leave behind of A; None: there are none."""
@@ -167,7 +167,7 @@ def joints_of(
     inner = torch.nonzero(known.all(1))[:, 0]
     follows = torch.zeros(count, dtype=torch.bool, device=at.device)
     follows[joint[inner, 1]] = True
-    diagonal = hessian.read(at[:, :, None], at[:, None])
+    diagonal = hessian.own[plan.joints][used]
     for end in range(2):
         own, side = torch.nonzero(known[:, end])[:, 0], slice(end * width, (end + 1) * width)
         diagonal.index_add_(0, joint[own, end], -taken[own, side, side])

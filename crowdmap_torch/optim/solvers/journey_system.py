@@ -52,9 +52,11 @@ class JourneySystem:
     """
 
     tile: Int[Tensor, "n 2"]
-    """Row and column of every tile that holds anything, in the grid of the landmarks' matrix."""
-    information: Float[Tensor, "n w w"]
-    """The tiles of S_d, those of the diagonal and above it."""
+    """Row and column of every tile of S_d that holds anything, on the diagonal and above it, in the landmarks' grid."""
+    entry: Int[Tensor, " m"]
+    """Where its numbers are in these tiles, one tile behind the other; all others are zero."""
+    information: Float[Tensor, " m"]
+    """The numbers."""
     row: Int[Tensor, " k"]
     """The rows of tiles that it has to do with: where its landmarks are."""
     right_side: Float[Tensor, "k w"]
@@ -64,21 +66,25 @@ class JourneySystem:
     def of(cls, system: TileMatrix) -> JourneySystem:
         """A reduced system and its right-hand side; the tensors are copies."""
         pattern = system.pattern
-        tile = torch.nonzero(pattern.present)
+        area, flat = pattern.width**2, system.tiles.flatten()
+        at = torch.nonzero(flat)[:, 0]
+        used, number = torch.unique_consecutive(at // area, return_inverse=True)
         padded = system.right_side.new_zeros(pattern.tiles * pattern.width)
         padded[: pattern.dim] = system.right_side
         by_row = padded.view(-1, pattern.width)
         row = torch.nonzero(by_row.any(1))[:, 0]
-        used = system.tiles.flatten(1).any(1)
-        return cls(tile[used], system.tiles[used], row, by_row[row])
+        # Of drives most tiles hold little: it goes to where it is added up in a quarter of their size.
+        entry = (number * area + at % area).to(torch.int32)
+        return cls(torch.nonzero(pattern.present)[used], entry, flat[at], row, by_row[row])
 
     def add_to(self, system: TileMatrix) -> None:
         """Adds it to a system whose grid is the same and that has its tiles, in place."""
         pattern = system.pattern
         area, of_row = pattern.width**2, self.tile[:, 0] * pattern.tiles + self.tile[:, 1]
-        place = pattern.base[: pattern.tiles, : pattern.tiles].flatten()[of_row] // area
-        assert bool((place >= 0).all()), "the sum has the tiles of its summands"
-        system.tiles.index_add_(0, place, self.information)
+        begin = pattern.base[: pattern.tiles, : pattern.tiles].flatten()[of_row]
+        assert bool((begin >= 0).all()), "the sum has the tiles of its summands"
+        entry = self.entry.long()
+        system.flat.index_add_(0, begin[entry // area] + entry % area, self.information)
         padded = system.flat[pattern.count * area :][: pattern.tiles * pattern.width]
         padded.view(-1, pattern.width).index_add_(0, self.row, self.right_side)
 
@@ -124,12 +130,15 @@ class Summed:
     factor: TiledCholesky | None = None
     added: Float[Tensor, " r"] | None = None
     """To the diagonal of C."""
+    gap: Float[Tensor, " r"] | None = None
+    """Ones where a column is nobody's, which stands for itself."""
 
     def make_room(self, own: ChainNormalEquations, tiles: Iterator[Int[Tensor, "n 2"]]) -> None:
         """Memory for the sum of systems with these tiles, unless it is there already."""
         # The last factors are in the same memory.
         self.factor = None
         pattern = own.structure.reduced
+        self.gap = (~own.structure.where.used[0]).to(own.gradient)
         present = torch.zeros_like(pattern.present)
         for tile in tiles:
             row, column = tile.long().unbind(1)
@@ -149,13 +158,13 @@ class Summed:
         self, added: Float[Tensor, " r"], parts: Iterator[JourneySystem]
     ) -> Float[Tensor, " r"] | None:
         """The right-hand side of the sum, which is factorised; None: it is not positive definite."""
-        system = self.system
-        assert system is not None, "of the leader"
+        system, gap = self.system, self.gap
+        assert system is not None and gap is not None, "of the leader"
         self.factor = None
         system.flat.zero_()
         for part in parts:
             part.add_to(system)
-        system.add_diagonal(added)
+        system.add_diagonal(added + gap)
         self.factor, self.added = TiledCholesky.of(system), added
         return None if self.factor is None else system.right_side
 

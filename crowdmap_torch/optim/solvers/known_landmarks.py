@@ -20,7 +20,7 @@ from crowdmap_torch.optim.solvers.joints import Joints, joints_of
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
-from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
 from crowdmap_torch.processes.threads import in_order
 
 _AT_ONCE = 1 << 13
@@ -45,7 +45,7 @@ class KnownLandmarks:
         diagonal: Float[Tensor, "e k k"],
         link: Float[Tensor, "e k k"],
         coupling: Mapping[str, Float[Tensor, "f w _"]],
-        hessian: TileMatrix,
+        hessian: StayingBlocks,
         leads: tuple[tuple[Lead, ...], ...] | None = None,
     ) -> KnownLandmarks:
         """That of normal equations; `leads` where they are known already."""

@@ -21,7 +21,7 @@ _WIDTH = 96
 """Of tiles on a processor: what fits its cache, and no more zeros than need be."""
 _WIDTH_CUDA = 1024
 """Of tiles on a GPU, where a call costs as much as the arithmetic of a small one."""
-_ABSENT = -(1 << 60)
+_ABSENT = -(1 << 31)
 """Where no tile is: no place in any memory."""
 
 
@@ -44,14 +44,14 @@ class TilePattern:
     width: int
     present: Bool[Tensor, "t t"]
     """Above the diagonal, and on it; the diagonal's are all there."""
-    number: tuple[tuple[int, ...], ...]
-    """Of each that is there; -1 else."""
+    number: tuple[dict[int, int], ...]
+    """By row and column, of each that is there."""
     columns: tuple[tuple[int, ...], ...]
     """By row, the columns of the tiles right of the diagonal."""
     own: Int[Tensor, " t"]
     """Numbers of the diagonal's."""
     base: Int[Tensor, "u u"]
-    """Where in memory each tile begins, those of the right-hand side and of what is forgotten included."""
+    """Where in memory each tile begins, and the right-hand side's and what is forgotten; in 32 bits if that is enough."""
 
     @classmethod
     def of(
@@ -64,18 +64,22 @@ class TilePattern:
         tiles, area, count = len(upper), width * width, int(upper.sum())
         behind = count * area
         forgotten = behind + tiles * width
-        base = np.full((tiles + 2, tiles + 2), forgotten, dtype=np.int64)
+        end = forgotten + (tiles + 2) * area
+        kind = np.int32 if end <= -_ABSENT else np.int64
+        base = np.full((tiles + 2, tiles + 2), forgotten, dtype=kind)
         inner = np.where(upper, number * area, _ABSENT)
         base[:tiles, :tiles] = np.where(np.tri(tiles, k=-1, dtype=bool), forgotten, inner)
         base[tiles, :tiles] = behind + width * np.arange(tiles)
+        there = [np.nonzero(row)[0] for row in upper]
         return cls(
             dim=dim,
             width=width,
             present=torch.from_numpy(upper).to(device),
-            number=tuple(map(tuple, number.tolist())),
-            columns=tuple(
-                tuple((np.nonzero(row[i + 1 :])[0] + i + 1).tolist()) for i, row in enumerate(upper)
+            number=tuple(
+                dict(zip(of.tolist(), number[i, of].tolist(), strict=True))
+                for i, of in enumerate(there)
             ),
+            columns=tuple(tuple(of[1:].tolist()) for of in there),
             own=torch.from_numpy(number.diagonal().copy()).to(device),
             base=torch.from_numpy(base).to(device),
         )
@@ -105,14 +109,6 @@ class TilePattern:
                 upper[first] |= upper[row]
                 upper[first, :first] = False
         return TilePattern.of(self.dim, self.width, upper, self.own.device)
-
-    def numbers_of(self, other: TilePattern) -> Int[Tensor, " count"]:
-        """The numbers here of another pattern's tiles, which are among these."""
-        row, column = torch.nonzero(other.present, as_tuple=True)
-        table = torch.tensor(self.number, dtype=torch.long, device=row.device).view(
-            self.tiles, self.tiles
-        )
-        return table[row, column]
 
     def place(self, entry: Int[Tensor, ...]) -> tuple[Int[Tensor, ...], Int[Tensor, ...]]:
         """The tile of an entry, and where in it that is; `dim` is the right-hand side, `dim + 1` forgotten."""
@@ -175,12 +171,6 @@ class TileMatrix:
         self.flat.index_add_(
             0, self.pattern.at(row + down, column + right).flatten(), block.flatten()
         )
-
-    def copy_from(self, other: TileMatrix, number: Int[Tensor, " count"]) -> None:
-        """Takes the tiles of another matrix, which have these numbers here, in place; the right-hand side stays."""
-        tiles = self.tiles
-        tiles.zero_()
-        tiles[number] = other.tiles
 
     def read(self, row: Int[Tensor, ...], column: Int[Tensor, ...]) -> Float[Tensor, ...]:
         """Entries, rows and columns broadcast; ValueError where there is no tile."""

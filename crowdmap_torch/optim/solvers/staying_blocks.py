@@ -1,0 +1,68 @@
+"""The matrix C of `chain_schur`, block by block: what rows bind of landmarks and border, and no zeros between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.optim.solvers.layout import Layout
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+
+
+class Between(NamedTuple):
+    """Blocks between two variables that stay; those of one place add up."""
+
+    row: Int[Tensor, " m"]
+    column: Int[Tensor, " m"]
+    """First row and first column of each."""
+    square: Float[Tensor, "k l m"]
+
+    def joined(self) -> Between:
+        """The same with neighbours of one place added up."""
+        at = torch.stack((self.row, self.column))
+        at, of = torch.unique_consecutive(at, return_inverse=True, dim=1)
+        if at.shape[1] == len(self.row):
+            return self
+        total = self.square.new_zeros(*self.square.shape[:2], at.shape[1])
+        return Between(at[0], at[1], total.index_add_(2, of, self.square))
+
+
+@dataclass(frozen=True)
+class StayingBlocks:
+    """What rows say of everything that is not eliminated."""
+
+    where: Layout
+    own: Mapping[str, Float[Tensor, "n k k"]]
+    """Of every block with itself, by variable."""
+    between: tuple[Between, ...]
+    has_gaps: bool
+    """Whether what is nobody's column stands for itself."""
+
+    def diagonal(self) -> Float[Tensor, " r"]:
+        """Its diagonal."""
+        own = {name: square.diagonal(dim1=1, dim2=2) for name, square in self.own.items()}
+        total = self.where.pack(own)[0]
+        for row, column, square in self.between:
+            # A row may touch a block twice.
+            twice = torch.nonzero(row == column)[:, 0]
+            of_twice = square[..., twice].diagonal()
+            at = row[twice, None] + torch.arange(of_twice.shape[1], device=row.device)
+            total.index_add_(0, at.flatten(), 2 * of_twice.flatten())
+        return total + (~self.where.used[0]).to(total) if self.has_gaps else total
+
+    def add_to(self, system: TileMatrix) -> None:
+        """Adds it to a matrix that has tiles for it, in place."""
+        for name, square in self.own.items():
+            offset = self.where.offset[name]
+            system.add(offset, offset, square.permute(1, 2, 0))
+        for row, column, square in self.between:
+            system.add(row, column, square)
+            system.add(column, row, square.transpose(0, 1))
+        if self.has_gaps:
+            gap = torch.nonzero(~self.where.used[0])[:, 0]
+            system.add(gap, gap, system.flat.new_ones(1, 1, len(gap)))

@@ -1,0 +1,105 @@
+"""The matrix of what stays, block by block, against the same matrix in full."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from crowdmap_torch.optim.problem import Variable, euclidean
+from crowdmap_torch.optim.solvers.journey_system import JourneySystem
+from crowdmap_torch.optim.solvers.layout import Layout
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
+from crowdmap_torch.optim.solvers.staying_blocks import Between, StayingBlocks
+
+SIGN, LANE = Variable(4, euclidean).tangent_dim, Variable(3, euclidean).tangent_dim
+WIDTH = 8
+
+
+def blocks(seed, *, has_gaps=True):
+    """Three signs and two lane points, a column between them that is nobody's, and the same matrix in full."""
+    draw = torch.Generator().manual_seed(seed)
+    sign, lane = torch.tensor([0, 4, 8]), torch.tensor([13, 16])
+    used = torch.ones(1, 19, dtype=torch.bool)
+    used[0, 12] = False
+    where = Layout(
+        {"sign": sign, "lane": lane},
+        {"sign": torch.zeros_like(sign), "lane": torch.zeros_like(lane)},
+        {"sign": SIGN, "lane": LANE},
+        19,
+        used,
+    )
+    own = {
+        "sign": torch.randn(3, SIGN, SIGN, dtype=torch.float64, generator=draw),
+        "lane": torch.randn(2, LANE, LANE, dtype=torch.float64, generator=draw),
+    }
+    own = {name: square + square.mT for name, square in own.items()}
+    # The last two are of one place, the second touches a lane point twice.
+    between = [
+        Between(
+            sign[[0, 2, 2]],
+            lane[[1, 0, 0]],
+            torch.randn(SIGN, LANE, 3, dtype=torch.float64, generator=draw),
+        ),
+        Between(
+            lane[[0]], lane[[0]], torch.randn(LANE, LANE, 1, dtype=torch.float64, generator=draw)
+        ),
+    ]
+    full = torch.zeros(19, 19, dtype=torch.float64)
+    for name, at in where.offset.items():
+        k = where.tangent_dim[name]
+        for begin, square in zip(at.tolist(), own[name], strict=True):
+            full[begin : begin + k, begin : begin + k] += square
+    for row, column, square in between:
+        for i, (r, c) in enumerate(zip(row.tolist(), column.tolist(), strict=True)):
+            here, there = slice(r, r + square.shape[0]), slice(c, c + square.shape[1])
+            full[here, there] += square[..., i]
+            full[there, here] += square[..., i].T
+    if has_gaps:
+        full[12, 12] = 1
+    return StayingBlocks(where, own, tuple(of.joined() for of in between), has_gaps), full
+
+
+def all_tiles(full):
+    count = -(-len(full) // WIDTH)
+    pattern = TilePattern.of(len(full), WIDTH, np.ones((count, count), bool), full.device)
+    return TileMatrix.zeros(pattern, full)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("has_gaps", [True, False])
+def test_blocks_add_up_to_the_matrix(seed, has_gaps):
+    found, full = blocks(seed, has_gaps=has_gaps)
+    system = all_tiles(full)
+    found.add_to(system)
+    torch.testing.assert_close(system.dense(), full)
+    torch.testing.assert_close(found.diagonal(), full.diagonal())
+
+
+def test_neighbours_of_one_place_are_added_up():
+    found, _ = blocks(0)
+    assert [len(of.row) for of in found.between] == [2, 1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_summand_holds_the_numbers_that_are_there_and_adds_them_to_others(seed):
+    found, full = blocks(seed)
+    system = all_tiles(full)
+    found.add_to(system)
+    system.right_side.copy_(torch.arange(19.0))
+    summand = JourneySystem.of(system)
+    assert len(summand.information) == int((system.tiles != 0).sum())
+    total = all_tiles(full)
+    for _ in range(2):
+        summand.add_to(total)
+    torch.testing.assert_close(total.dense(), 2 * system.dense(), rtol=0, atol=0)
+    torch.testing.assert_close(total.right_side, 2 * system.right_side, rtol=0, atol=0)
+
+
+def test_a_sum_without_the_tiles_of_a_summand_is_refused():
+    found, full = blocks(0)
+    system = all_tiles(full)
+    found.add_to(system)
+    diagonal = TilePattern.of(19, WIDTH, np.eye(3, dtype=bool), full.device)
+    with pytest.raises(AssertionError, match="has the tiles of its summands"):
+        JourneySystem.of(system).add_to(TileMatrix.zeros(diagonal, full))
