@@ -135,7 +135,7 @@ class ReducibleSums(ChainSums):
         """Adds the blocks between two variables that stay."""
         where, (name, block), (name_of_other, block_of_other) = self.structure.where, one, other
         row, column = where.offset[name][block], where.offset[name_of_other][block_of_other]
-        self._between.append(Between(row, column, square).joined())
+        self._between.append(Between(row, column, square, where.dim).joined())
 
     def add_lots(self) -> None:
         """Adds what was summed by lot, once all rows are there."""

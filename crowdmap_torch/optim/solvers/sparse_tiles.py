@@ -6,6 +6,7 @@ grows with the tiles, not with the square of the unknowns. Where everything is b
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -44,14 +45,6 @@ class TilePattern:
     width: int
     present: Bool[Tensor, "t t"]
     """Above the diagonal, and on it; the diagonal's are all there."""
-    number: tuple[dict[int, int], ...]
-    """By row and column, of each that is there."""
-    columns: tuple[tuple[int, ...], ...]
-    """By row, the columns of the tiles right of the diagonal."""
-    own: Int[Tensor, " t"]
-    """Numbers of the diagonal's."""
-    base: Int[Tensor, "u u"]
-    """Where in memory each tile begins, and the right-hand side's and what is forgotten; in 32 bits if that is enough."""
 
     @classmethod
     def of(
@@ -60,39 +53,51 @@ class TilePattern:
         """That of tiles of which those above the diagonal count."""
         upper = np.triu(present)
         np.fill_diagonal(upper, val=True)
-        number = np.where(upper, np.cumsum(upper).reshape(upper.shape) - 1, -1)
-        tiles, area, count = len(upper), width * width, int(upper.sum())
-        behind = count * area
-        forgotten = behind + tiles * width
-        end = forgotten + (tiles + 2) * area
-        kind = np.int32 if end <= -_ABSENT else np.int64
-        base = np.full((tiles + 2, tiles + 2), forgotten, dtype=kind)
-        inner = np.where(upper, number * area, _ABSENT)
-        base[:tiles, :tiles] = np.where(np.tri(tiles, k=-1, dtype=bool), forgotten, inner)
-        base[tiles, :tiles] = behind + width * np.arange(tiles)
-        there = [np.nonzero(row)[0] for row in upper]
-        return cls(
-            dim=dim,
-            width=width,
-            present=torch.from_numpy(upper).to(device),
-            number=tuple(
-                dict(zip(of.tolist(), number[i, of].tolist(), strict=True))
-                for i, of in enumerate(there)
-            ),
-            columns=tuple(tuple(of[1:].tolist()) for of in there),
-            own=torch.from_numpy(number.diagonal().copy()).to(device),
-            base=torch.from_numpy(base).to(device),
-        )
+        return cls(dim, width, torch.from_numpy(upper).to(device))
 
     @property
     def tiles(self) -> int:
         """Tiles of the diagonal."""
-        return len(self.columns)
+        return len(self.present)
 
     @cached_property
     def count(self) -> int:
         """All tiles."""
-        return self.tiles + sum(len(row) for row in self.columns)
+        return int(self.present.sum())
+
+    @cached_property
+    def columns(self) -> tuple[tuple[int, ...], ...]:
+        """By row, the columns of the tiles right of the diagonal."""
+        return tuple(tuple(np.nonzero(row)[0][1:].tolist()) for row in self.present.cpu().numpy())
+
+    @cached_property
+    def number(self) -> tuple[dict[int, int], ...]:
+        """By row and column, the number of each that is there."""
+        after = itertools.count()
+        return tuple(
+            {column: next(after) for column in (row, *right)}
+            for row, right in enumerate(self.columns)
+        )
+
+    @cached_property
+    def own(self) -> Int[Tensor, " t"]:
+        """Numbers of the diagonal's."""
+        return self.present.sum(1).cumsum(0) - self.present.sum(1)
+
+    @cached_property
+    def base(self) -> Int[Tensor, "u u"]:
+        """Where in memory each tile begins, and the right-hand side's and what is forgotten; in 32 bits if they do."""
+        upper, tiles, area = self.present.cpu().numpy(), self.tiles, self.width**2
+        behind = self.count * area
+        forgotten = behind + tiles * self.width
+        most = max(forgotten + (tiles + 2) * area, (tiles + 2) ** 2)
+        kind = np.int32 if most <= -_ABSENT else np.int64
+        base = np.full((tiles + 2, tiles + 2), forgotten, dtype=kind)
+        inner = np.where(np.tri(tiles, k=-1, dtype=bool), forgotten, _ABSENT)
+        inner[upper] = area * np.arange(self.count)
+        base[:tiles, :tiles] = inner
+        base[tiles, :tiles] = behind + self.width * np.arange(tiles)
+        return torch.from_numpy(base).to(self.present.device)
 
     @property
     def size(self) -> int:
@@ -108,20 +113,26 @@ class TilePattern:
                 first = row + 1 + right[0]
                 upper[first] |= upper[row]
                 upper[first, :first] = False
-        return TilePattern.of(self.dim, self.width, upper, self.own.device)
+        return TilePattern.of(self.dim, self.width, upper, self.present.device)
 
-    def place(self, entry: Int[Tensor, ...]) -> tuple[Int[Tensor, ...], Int[Tensor, ...]]:
-        """The tile of an entry, and where in it that is; `dim` is the right-hand side, `dim + 1` forgotten."""
+    def at(self, row: Int[Tensor, ...], column: Int[Tensor, ...]) -> Int[Tensor, ...]:
+        """Where in memory entries are, rows and columns broadcast; no place at all where there is no tile.
+
+        Row `dim` is the right-hand side, `dim + 1` forgotten.
+        """
+        (down, r), (right, c) = self._tile(row), self._tile(column)
+        tile = down * len(self.base) + right
+        begin = self.base.flatten().index_select(0, tile.flatten()).view(tile.shape)
+        return begin.add_(r * self.width).add_(c)
+
+    def _tile(self, entry: Int[Tensor, ...]) -> tuple[Int[Tensor, ...], Int[Tensor, ...]]:
+        """The tile of an entry, and where in it that is."""
+        entry = entry.to(self.base.dtype)
         tile = torch.div(entry, self.width, rounding_mode="floor")
         within = entry - tile * self.width
         beyond = entry - self.dim
         tile = torch.where(beyond >= 0, self.tiles + beyond, tile)
         return tile, torch.where(beyond >= 0, 0, within)
-
-    def at(self, row: Int[Tensor, ...], column: Int[Tensor, ...]) -> Int[Tensor, ...]:
-        """Where in memory entries are, rows and columns broadcast; no place at all where there is no tile."""
-        (down, r), (right, c) = self.place(row), self.place(column)
-        return self.base[down, right] + (r * self.width + c)
 
 
 @dataclass(frozen=True)

@@ -21,15 +21,18 @@ class Between(NamedTuple):
     column: Int[Tensor, " m"]
     """First row and first column of each."""
     square: Float[Tensor, "k l m"]
+    stride: int
+    """Columns of the matrix."""
 
     def joined(self) -> Between:
         """The same with neighbours of one place added up."""
-        at = torch.stack((self.row, self.column))
-        at, of = torch.unique_consecutive(at, return_inverse=True, dim=1)
-        if at.shape[1] == len(self.row):
+        key = self.row * self.stride + self.column
+        at, of = torch.unique_consecutive(key, return_inverse=True)
+        if len(at) == len(key):
             return self
-        total = self.square.new_zeros(*self.square.shape[:2], at.shape[1])
-        return Between(at[0], at[1], total.index_add_(2, of, self.square))
+        total = self.square.new_zeros(*self.square.shape[:2], len(at))
+        total.index_add_(2, of, self.square)
+        return Between(at // self.stride, at % self.stride, total, self.stride)
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class StayingBlocks:
         """Its diagonal."""
         own = {name: square.diagonal(dim1=1, dim2=2) for name, square in self.own.items()}
         total = self.where.pack(own)[0]
-        for row, column, square in self.between:
+        for row, column, square, _ in self.between:
             # A row may touch a block twice.
             twice = torch.nonzero(row == column)[:, 0]
             of_twice = square[..., twice].diagonal()
@@ -60,7 +63,7 @@ class StayingBlocks:
         for name, square in self.own.items():
             offset = self.where.offset[name]
             system.add(offset, offset, square.permute(1, 2, 0))
-        for row, column, square in self.between:
+        for row, column, square, _ in self.between:
             system.add(row, column, square)
             system.add(column, row, square.transpose(0, 1))
         if self.has_gaps:

@@ -123,7 +123,7 @@ def reduced_pattern(
     """
     present = _bound(group, stays.ordered[place], stays, direct.width)
     present |= direct.present.cpu().numpy() | _between(stays, beside, direct.width)
-    found = TilePattern.of(direct.dim, direct.width, present, direct.own.device)
+    found = TilePattern.of(direct.dim, direct.width, present, direct.present.device)
     return found.filled() if is_factored else found
 
 

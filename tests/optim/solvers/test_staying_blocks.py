@@ -40,9 +40,13 @@ def blocks(seed, *, has_gaps=True):
             sign[[0, 2, 2]],
             lane[[1, 0, 0]],
             torch.randn(SIGN, LANE, 3, dtype=torch.float64, generator=draw),
+            19,
         ),
         Between(
-            lane[[0]], lane[[0]], torch.randn(LANE, LANE, 1, dtype=torch.float64, generator=draw)
+            lane[[0]],
+            lane[[0]],
+            torch.randn(LANE, LANE, 1, dtype=torch.float64, generator=draw),
+            19,
         ),
     ]
     full = torch.zeros(19, 19, dtype=torch.float64)
@@ -50,7 +54,7 @@ def blocks(seed, *, has_gaps=True):
         k = where.tangent_dim[name]
         for begin, square in zip(at.tolist(), own[name], strict=True):
             full[begin : begin + k, begin : begin + k] += square
-    for row, column, square in between:
+    for row, column, square, _ in between:
         for i, (r, c) in enumerate(zip(row.tolist(), column.tolist(), strict=True)):
             here, there = slice(r, r + square.shape[0]), slice(c, c + square.shape[1])
             full[here, there] += square[..., i]
