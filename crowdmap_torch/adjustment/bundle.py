@@ -244,8 +244,9 @@ class Bundle(BundleState):
         """What lasts of detections' shifts by the errors of all corners, and whether it has come to rest."""
         if not len(of_corners) or self.config.method == "paper2017":
             return self.lasting, True
-        rows = self.whole.corners
-        detections, counted = self.whole.detections, ~self.given_up[rows.detection]
+        rows, detections = self.whole.corners, self.whole.detections
+        # Corners of boxes tell little of it, and would hide that of outlines; the centre of a box counts.
+        counted = ~self.given_up[rows.detection] & (rows.loose_px == 0)
         seen = lasting_variance(detections, of_corners, self._sigma_of(rows), counted)
         white = self.scale[0].square() / detections.most
         rests = (seen - self.lasting).abs() <= _LASTING_RESTS * (seen + white)
