@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
@@ -38,12 +38,18 @@ class ActiveTracklets:
 
     def __getitem__(self: Active, index: np.ndarray) -> Active:
         """The tracklets at `index`."""
-        return type(self)(*(getattr(self, f.name)[index] for f in fields(self)))
+        return type(self)(*(column[index] for column in vars(self).values()))
 
     def followed_by(self: Active, other: Active) -> Active:
         """These tracklets, then those of `other`."""
-        columns = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        columns = zip(vars(self).values(), vars(other).values(), strict=True)
         return type(self)(*map(np.concatenate, columns))
+
+    def without(self: Active, rows: Int[np.ndarray, " k"]) -> Active:
+        """All but the tracklets in these rows."""
+        kept = np.ones(len(self), dtype=bool)
+        kept[rows] = False
+        return self[kept]
 
 
 class CausalAssociator(Generic[Active, Features]):

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.correspondence import vertex_costs
 from crowdmap_torch.geometry.epipolar import fundamental
 from crowdmap_torch.ranges import Cost, Count, Factor, Length, Settings, Sigma, Span
-from crowdmap_torch.tables import LaneDetections, LanePoints, Rig, Rows
+from crowdmap_torch.tables import LaneDetections, LanePoints, Rig, Rows, concatenate
 
 METHODS = ("ground", "paper2017")
 SAMPLES = 6
@@ -56,7 +57,7 @@ class LaneAssociationConfig(Settings):
     reach_m: Span = (2.0, 45.0)
     """Points nearer or further ahead on the road plane are left out."""
     chunk_pairs: Count = 1 << 13
-    """Pairs whose costs are computed at once, of both methods."""
+    """Pairs whose costs are computed at once; method `paper2017`."""
 
     def __post_init__(self) -> None:
         """Refuses an unknown method."""
@@ -83,7 +84,8 @@ class LaneFeatures(Rows):
     T_world_road: Float[Tensor, "d 4 4"]
     """Road frame: under the camera, x ahead, y left, z up."""
     line_ideal: Float[Tensor, "d s 2"]
-    """Samples of the straight line through the detection's image points, on the plane z = 1."""
+    """Samples of the straight line through the detection's image points, on the plane z = 1; but for method `paper2017`
+    none."""
     focal: Float[Tensor, " d"]
     T_world_camera: Float[Tensor, "d 4 4"]
 
@@ -117,7 +119,9 @@ def lane_features(
         curve=curve,
         extent=extent,
         T_world_road=T_world_camera @ T_camera_road,
-        line_ideal=_image_lines(points, count),
+        line_ideal=_image_lines(points, count)
+        if config.method == "paper2017"
+        else points.ideal.new_zeros(count, 0, 2),
         focal=focal,
         T_world_camera=T_world_camera,
     )
@@ -140,35 +144,72 @@ def lane_pair_costs(
     """Cost of linking each lane detection of `a` with the later one of `b` in the same row."""
     if config.method == "paper2017":
         return _printed_costs(a, b)
-    cost = _ground_costs(a, b, config)
-    differs = (a.type != b.type) & (a.type >= 0) & (b.type >= 0)
-    return cost + config.type_penalty * differs
+    lines, first = GroundLines.of(concatenate((a, b)), config), np.arange(len(a))
+    return torch.from_numpy(lines.costs(first, first + len(a), config)).to(a.focal)
 
 
-def _ground_costs(
-    a: LaneFeatures, b: LaneFeatures, config: LaneAssociationConfig
-) -> Float[Tensor, " p"]:
-    """Mean squared sideways distance of `b`'s line from `a`'s on the road, in standard deviations."""
-    share = torch.linspace(0, 1, SAMPLES, dtype=b.extent.dtype, device=b.extent.device)
-    near, far = b.extent[:, :1], b.extent[:, 1:]
-    x = near + (far - near).clamp_max(25.0) * share
-    y = _sideways(b.curve, x)
-    # The points are on the road's plane, and what matters of them in the other frame is x and y.
-    T_a_b = (se3.inverse(a.T_world_road) @ b.T_world_road)[:, :2, :, None]
-    ahead, sideways = (row[:, 0] * x + row[:, 1] * y + row[:, 3] for row in T_a_b.unbind(1))
-    low, high = a.extent[:, :1], a.extent[:, 1:]
-    inside = torch.minimum(torch.maximum(ahead, low), high)
-    beyond = (ahead - inside).abs()
-    # Beyond its ends the line goes on straight.
-    slope = a.curve[:, 1:2] + 2 * a.curve[:, 2:] * inside
-    expected = _sideways(a.curve, inside) + slope * (ahead - inside)
-    sigma = config.sigma_m + config.sigma_per_m * x + config.turn_sigma_per_m * beyond
-    error = ((sideways - expected) / sigma).square()
-    usable = beyond < config.max_beyond_m
-    count = usable.sum(-1)
-    cost = (error * usable).sum(-1) / count.clamp_min(1)
-    is_line = (a.extent[:, 1] > 0) & (b.extent[:, 1] > 0) & (count > 0)
-    return torch.where(is_line, cost, torch.inf)
+@dataclass(frozen=True)
+class GroundLines:
+    """What costs on the road need of each detection, as NumPy's arrays.
+
+    Few pairs are asked for in a frame, and all but those with active tracklets are never: computed when asked for they take
+    a fourth of the time of all in the window ahead.
+    """
+
+    type: Int[np.ndarray, " d"]
+    curve: Float[np.ndarray, "d 3 1"]
+    extent: Float[np.ndarray, "d 2 1"]
+    is_line: Bool[np.ndarray, " d"]
+    place_world: Float[np.ndarray, "d 4 s"]
+    """Places along the line, homogeneous."""
+    sigma: Float[np.ndarray, "d s"]
+    """Sideways noise there [m]."""
+    plane_world: Float[np.ndarray, "d 2 4"]
+    """What takes places to x ahead and y to the left on the detection's road."""
+
+    @classmethod
+    def of(cls, features: LaneFeatures, config: LaneAssociationConfig) -> GroundLines:
+        """Of detections, wherever their tensors are."""
+        share = torch.linspace(0, 1, SAMPLES).to(features.extent)
+        near, far = features.extent[:, :1], features.extent[:, 1:]
+        x = near + (far - near).clamp_max(25.0) * share
+        c = features.curve[:, :, None]
+        y = c[:, 0] + c[:, 1] * x + c[:, 2] * x.square()
+        place_road = torch.stack((x, y, torch.zeros_like(x), torch.ones_like(x)), dim=1)
+        sigma = config.sigma_m + config.sigma_per_m * x
+        columns = (
+            *(features.type, c, features.extent[:, :, None], features.extent[:, 1] > 0),
+            *(features.T_world_road @ place_road, sigma),
+            # The places are on the road's plane, and what matters of them in another frame is x and y.
+            se3.inverse(features.T_world_road)[:, :2],
+        )
+        return cls(*(column.cpu().numpy() for column in columns))
+
+    def costs(
+        self,
+        last: Int[np.ndarray, "*#pairs"],
+        rows: Int[np.ndarray, "*#pairs"],
+        config: LaneAssociationConfig,
+    ) -> Float[np.ndarray, "*pairs"]:
+        """Mean squared sideways distance of each later line from the earlier one, in standard deviations; and types."""
+        seen = self.plane_world[last] @ self.place_world[rows]
+        ahead, sideways = seen[..., 0, :], seen[..., 1, :]
+        extent, curve = self.extent[last], self.curve[last]
+        inside = np.minimum(np.maximum(ahead, extent[..., 0, :]), extent[..., 1, :])
+        off_end = ahead - inside
+        beyond = np.abs(off_end)
+        # Beyond its ends the line goes on straight.
+        bend = curve[..., 2, :] * inside
+        slope = curve[..., 1, :] + 2 * bend
+        expected = curve[..., 0, :] + (curve[..., 1, :] + bend) * inside + slope * off_end
+        error = (sideways - expected) / (self.sigma[rows] + config.turn_sigma_per_m * beyond)
+        usable = beyond < config.max_beyond_m
+        count = usable.sum(-1)
+        cost = (error * error * usable).sum(-1) / np.maximum(count, 1)
+        before, now = self.type[last], self.type[rows]
+        cost += config.type_penalty * ((before != now) & (before >= 0) & (now >= 0))
+        cost[~(self.is_line[last] & self.is_line[rows] & (count > 0))] = np.inf
+        return cost
 
 
 def _printed_costs(a: LaneFeatures, b: LaneFeatures) -> Float[Tensor, " p"]:
@@ -181,10 +222,6 @@ def _printed_costs(a: LaneFeatures, b: LaneFeatures) -> Float[Tensor, " p"]:
     return cost.sum((-1, -2)) * a.focal * b.focal
 
 
-def _sideways(curve: Float[Tensor, "p 3"], x: Float[Tensor, "p s"]) -> Float[Tensor, "p s"]:
-    return curve[:, :1] + curve[:, 1:2] * x + curve[:, 2:] * x.square()
-
-
 def _fit_curves(
     x: Float[Tensor, " m"],
     y: Float[Tensor, " m"],
@@ -193,19 +230,21 @@ def _fit_curves(
     count: int,
 ) -> tuple[Float[Tensor, "d 3"], Float[Tensor, "d 2"]]:
     """Parabolas through the points of each detection, robust to outlier points, and the reach of their inliers."""
-    basis = torch.stack((torch.ones_like(x), x, x.square()), dim=-1)
+    # Rows last: every operation runs along them, and of the normal equations' nine sums five differ.
+    powers = torch.stack((torch.ones_like(x), x, x.square(), x**3, x**4))
+    place = torch.arange(3, device=x.device)
     # Markers go roughly ahead and bend with radii above some fifty metres.
     prior = torch.diag(1 / x.new_tensor([30.0, 0.5, 0.01]).square())
     weight = 1 / sigma.square()
     curve = x.new_zeros(count, 3)
     inlier = torch.ones_like(x, dtype=torch.bool)
     for iteration in range(6):
-        normal = prior.expand(count, 3, 3).clone()
-        right = x.new_zeros(count, 3)
-        normal.index_add_(0, detection, weight[:, None, None] * basis[:, :, None] * basis[:, None])
-        right.index_add_(0, detection, (weight * y)[:, None] * basis)
-        curve = torch.linalg.solve(normal, right[..., None])[..., 0]
-        error = ((basis * curve[detection]).sum(-1) - y).abs() / sigma
+        products = torch.cat((weight * powers, weight * y * powers[:3]))
+        sums = x.new_zeros(8, count).index_add_(1, detection, products).mT
+        normal = prior + sums[:, place[:, None] + place]
+        curve = torch.linalg.solve(normal, sums[:, 5:, None])[..., 0]
+        at = curve.mT.index_select(1, detection)
+        error = (at[0] + at[1] * x + at[2] * powers[2] - y).abs() / sigma
         # First the absolute error, then only what lies near the line.
         inlier = error < 3.0
         robust = 1 / error.clamp_min(0.5) if iteration < 4 else inlier.to(x)

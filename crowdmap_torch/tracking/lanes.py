@@ -21,6 +21,7 @@ from crowdmap_torch.tracking.causal import (
     window_costs,
 )
 from crowdmap_torch.tracking.lane_features import (
+    GroundLines,
     LaneAssociationConfig,
     LaneFeatures,
     lane_features,
@@ -53,8 +54,7 @@ class LaneAssociator(CausalAssociator[ActiveTracklets, LaneFeatures]):
         else:
             row, column = gated_matching(cost, self.config.unmatched_cost)
         label = self._labels(old, row, column, len(rows))
-        silent = np.delete(np.arange(len(old)), row)
-        self.active = old[silent].followed_by(ActiveTracklets(label, rows))
+        self.active = old.without(row).followed_by(ActiveTracklets(label, rows))
         return label
 
     @torch.no_grad()
@@ -88,8 +88,11 @@ def associate_lanes(journey: Journey, config: LaneAssociationConfig) -> Tracklet
     features = lane_features(detections, journey.lane_points, journey.rig, pose, config)
     order = torch.argsort(detections.frame, stable=True)
     features = features[order]
-    pair_costs = partial(lane_pair_costs, config=config)
-    costs = window_costs(features, pair_costs, window=config.window, chunk=config.chunk_pairs)
+    if config.method == "paper2017":
+        pair_costs = partial(lane_pair_costs, config=config)
+        costs = window_costs(features, pair_costs, window=config.window, chunk=config.chunk_pairs)
+    else:
+        costs = partial(GroundLines.of(features, config).costs, config=config)
     associator = LaneAssociator(config)
     frame = features.frame.cpu().numpy()
     label = np.full(len(order), -1)

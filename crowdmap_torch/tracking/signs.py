@@ -104,9 +104,8 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
             prediction[row], sighting[column], variance[column], trusted=TRUSTED_SIGMAS
         )
         state.mean[column], state.covariance[column] = updated.mean, updated.covariance
-        silent = np.delete(np.arange(len(old)), row)
         now = ActiveSigns(label, rows, votes, shift, state.mean, state.covariance)
-        self.active = old[silent].followed_by(now)
+        self.active = old.without(row).followed_by(now)
         return label, shift
 
     @torch.no_grad()
