@@ -246,25 +246,21 @@ class BandNormalEquations:
         d, width = self.where.path_dim, self.coupling.shape[-1]
         nodes, blocks = self.path.shape[:2]
         band = max(blocks * d, width)
-        lower = self.path_gradient.new_zeros(nodes * d * band)
-        node, back, i, j = (
-            torch.arange(k, device=lower.device).reshape(shape)
-            for k, shape in ((nodes, (-1, 1, 1, 1)), (blocks, (-1, 1, 1)), (d, (-1, 1)), (d, (-1,)))
-        )
-        below = back * d + i - j
-        is_lower = (below >= 0).expand_as(self.path)
-        at = ((node * d + j) * band + below).expand_as(self.path)
-        lower[at[is_lower]] = self.path[is_lower]
-        lower.view(nodes * d, band)[:, 0] += path_added
-        row, column = torch.tril_indices(width, width, device=lower.device)
-        start = self.where.first[:, None] * d
+        lower = self.path_gradient.new_zeros(nodes * d, band)
+        for j in range(d):
+            lower[j::d, : blocks * d - j] = self.path[..., j].flatten(1)[:, j:]
+        lower[:, 0] += path_added
+        start = (self.where.first * d).tolist()
         for some in torch.arange(len(inverse), device=lower.device).split(_LANDMARKS_AT_ONCE):
             # All at once would not stay in a processor's cache.
             coupling = self.coupling[some]
-            schur = coupling.mT @ inverse[some] @ coupling
-            at = (start[some] + column) * band + row - column
-            lower.index_add_(0, at.flatten(), -schur[:, row, column].flatten())
-        of_path = cholesky_banded(lower.view(nodes * d, band))
+            schur = (coupling.mT @ inverse[some] @ coupling).tril_()
+            for i, own in zip(some.tolist(), schur, strict=True):
+                # A square of the matrix in its storage by diagonals; its last row ends where its first column begins.
+                square = lower.as_strided((width, width), (1, band - 1), start[i] * band)
+                square[:-1] -= own[:-1]
+                square[-1] -= own[-1]
+        of_path = cholesky_banded(lower)
         if of_path is None:
             return None
         own = factor.diagonal(dim1=-2, dim2=-1).log().sum()
