@@ -41,7 +41,7 @@ from crowdmap_torch.optim.problem import (
     pull_positive,
 )
 from crowdmap_torch.optim.robust import Tukey
-from crowdmap_torch.optim.solvers.banded_schur import BandBackend
+from crowdmap_torch.optim.solvers.banded_schur import BandBackend, BandNormalEquations
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, NormalEquations
 from crowdmap_torch.ranges import Deviations, RoundsOrNone, Settings, Share
 from crowdmap_torch.residuals.reprojection import (
@@ -150,9 +150,9 @@ def fit_signs(
         whitened = _whitened(problem, state.values, shape, views)
         has_say = _mean_square(whitened, shape, views)[:, None] < config.tukey**2
         pose_error = torch.where(has_say, noise.likely_pose_error(whitened), 0.0)
-        if number == 0:
-            scale = _likely_scale(problem, state.values, len(at_knots), positioning, config.drift)
         normal = backend.assemble(problem, state.values)
+        if number == 0:
+            scale = _likely_scale(problem, state.values, normal, positioning, config.drift)
     assert normal is not None and whitened is not None
     return _read(
         normal,
@@ -293,24 +293,26 @@ def _with_drift(
 def _likely_scale(
     problem: Problem,
     values: Mapping[str, Tensor],
-    knots: int,
+    whole: BandNormalEquations,
     positioning: PositioningNoise,
     config: DriftPathConfig,
 ) -> float:
-    """The multiple of the usual drift under which the views are likeliest (marginal likelihood, to second order)."""
-    backend = BandBackend("drift")
-    whole = backend.assemble(problem, values)
-    chain = drift_terms(knots, 1.0, values["drift"], positioning, config)
-    alone = backend.assemble(replace(problem, terms=chain), values)
+    """The multiple of the usual drift under which the views are likeliest (marginal likelihood, to second order).
+
+    `whole` are the normal equations at these values.
+    """
+    at_knots = values["drift"]
+    chain = drift_terms(len(at_knots), 1.0, at_knots, positioning, config)
+    alone = BandBackend("drift").assemble(replace(problem, terms=chain), values)
     evidence = []
     for scale in config.scales:
         # The chain of the poses' six components is in the whole once, with the scale of one.
-        more = torch.zeros_like(values["drift"][0])
+        more = torch.zeros_like(at_knots[0])
         more[:6] = scale**-2 - 1
-        minus_log = whole.plus(alone, more, values["drift"]).log_evidence()
+        minus_log = whole.plus(alone, more, at_knots).log_evidence()
         # The chain's own normalisation, and how usual such a scale is.
         unusual = (math.log(scale) / config.sigma_log_scale) ** 2 / 2
-        evidence.append(float(minus_log) + 6 * knots * math.log(scale) + unusual)
+        evidence.append(float(minus_log) + 6 * len(at_knots) * math.log(scale) + unusual)
     return config.scales[min(range(len(evidence)), key=evidence.__getitem__)]
 
 
