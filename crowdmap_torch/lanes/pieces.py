@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -107,7 +109,7 @@ def well_seen(
     place = marker * (int(cell.max()) + 1) + cell
     at, _, _ = distinct_pairs(place, view)
     count = torch.bincount(at, minlength=int(place.max()) + 1)[place]
-    usual = _group_median(count.to(along), marker, int(marker.max()) + 1)[marker]
+    usual = _medians(count[marker.argsort(stable=True)].to(along), torch.bincount(marker))[marker]
     return count >= share * usual
 
 
@@ -210,85 +212,123 @@ def fit_pieces(
     iteration, with none of them all points count alike. `smoothing` is the price of bending in units of a piece's whole
     weight.
     """
-    count, piece = pieces.control_count, pieces.piece
-    point, expected = point_world[pieces.point], sigma[pieces.point]
+    count = pieces.control_count
+    # Those of one piece adjacent.
+    order = pieces.piece.argsort(stable=True)
+    piece, row = pieces.piece[order], pieces.point[order]
+    size = torch.bincount(piece, minlength=len(count))
+    expected = sigma[row]
     own = expected.square().reciprocal()
     kept = torch.ones_like(own)
-    base = _Basis(pieces.t, piece, count)
-    coefficient = base.solve(point, own, smoothing)
+    base = _Basis(pieces.t[order], piece, point_world[row], count)
+    coefficient = base.solve(own, smoothing)
     for scale in scales:
-        whitened = base.miss(coefficient, point) / expected
-        noise = _group_median(whitened.abs(), piece, len(count)) * 1.4826
+        whitened = base.miss(coefficient) / expected
+        noise = _medians(whitened.abs(), size) * 1.4826
         gate = scale * noise.clamp(0.5, 4.0)[piece]
         # Tukey alone would leave a piece whose points all disagree without any.
         kept = Tukey().weight((whitened / gate).square()).clamp_min(1e-6)
-        coefficient = base.solve(point, own * kept, smoothing)
-    miss = base.miss(coefficient, point)
-    noise = _group_median((miss / expected).abs(), piece, len(count)) * 1.4826
+        coefficient = base.solve(own * kept, smoothing)
+    miss = base.miss(coefficient)
+    noise = _medians((miss / expected).abs(), size) * 1.4826
     return LaneFit(
         control=spline_basis.from_coefficients_flat(coefficient, count),
         sigma=base.control_sigma(own * kept) * noise.clamp_min(0.5)[spline_basis.rows(count)[0]],
-        miss=miss,
-        weight=kept,
+        miss=torch.empty_like(miss).index_put((order,), miss),
+        weight=torch.empty_like(kept).index_put((order,), kept),
     )
 
 
 class _Basis:
-    """The B-splines of points at fixed parameters: what stays the same while weights change."""
+    """The B-splines of points at fixed parameters: what stays the same while weights change.
+
+    The rows come last: every operation runs along them. Products are summed up by segment, the stretch of a piece between
+    two knots, in which all points have the same control points around them.
+    """
 
     def __init__(
-        self, t: Float[Tensor, " r"], piece: Int[Tensor, " r"], count: Int[Tensor, " n"]
+        self,
+        t: Float[Tensor, " r"],
+        piece: Int[Tensor, " r"],
+        point: Float[Tensor, "r 3"],
+        count: Int[Tensor, " n"],
     ) -> None:
-        zero = torch.zeros_like(piece)
-        self.piece, self.count = piece, count
-        self.slot, self.w, self.dw = spline_basis.window_flat(t, zero, count[piece])
-        self.row = spline_basis.starts(count)[piece][:, None] + self.slot
-        self.longest = int(count.max()) if len(count) else 2
-        self.outer = (self.w[:, :, None] * self.w[:, None, :]).flatten(1)
-        cell = (piece[:, None, None] * self.longest + self.slot[:, :, None]) * self.longest
-        self.cell = (cell + self.slot[:, None, :]).flatten()
+        slot, w, dw = spline_basis.window_flat(t, torch.zeros_like(piece), count[piece])
+        self.count, self.longest = count, int(count.max()) if len(count) else 2
+        self.w, self.dw = w.mT.contiguous(), dw.mT.contiguous()
+        self.segment = piece * self.longest + slot[:, 0]
+        # Of every segment the control points around it, by their place among those of the piece.
+        knot = torch.arange(self.longest, device=t.device)
+        place = knot[:, None] + torch.arange(4, device=t.device)
+        self.place = torch.minimum(place, count[:, None, None] - 1)
+        size = torch.bincount(piece, minlength=len(count)).clamp_min(1)
+        self.centre = group_sum(point, piece, len(count)) / size[:, None]
+        self.offset = (point - self.centre[piece]).mT.contiguous()
 
-    def normal(self, weight: Float[Tensor, " r"]) -> Float[Tensor, "n k k"]:
+    def _by_segment(self, value: Float[Tensor, " r"]) -> Float[Tensor, "n k"]:
+        n, k = len(self.count), self.longest
+        return value.new_zeros(n * k).index_add_(0, self.segment, value).view(n, k)
+
+    def _by_pair(self, weight: Float[Tensor, " r"]) -> Float[Tensor, "n k 4 4"]:
+        """Products of the four B-splines of each segment."""
+        found = weight.new_zeros(*self.place.shape, 4)
+        for a, pulling in enumerate(weight * w for w in self.w):
+            for b in range(a, 4):
+                found[..., a, b] = found[..., b, a] = self._by_segment(pulling * self.w[b])
+        return found
+
+    def _of_pieces(self, by_pair: Float[Tensor, "n k 4 4"]) -> Float[Tensor, "n k k"]:
         """Normal equations of each piece, padded to the longest."""
         n, k = len(self.count), self.longest
-        flat = (weight[:, None] * self.outer).flatten()
-        return flat.new_zeros(n * k * k).index_add(0, self.cell, flat).reshape(n, k, k)
+        cell = self.place[..., :, None] * k + self.place[..., None, :]
+        flat = by_pair.new_zeros(n, k * k)
+        return flat.scatter_add_(1, cell.flatten(1), by_pair.flatten(1)).view(n, k, k)
 
-    def solve(
-        self, point: Float[Tensor, "r 3"], weight: Float[Tensor, " r"], smoothing: float
-    ) -> Float[Tensor, "c 3"]:
+    def solve(self, weight: Float[Tensor, " r"], smoothing: float) -> Float[Tensor, "c 3"]:
         """Coefficients of the weighted least squares fit."""
         n, k = len(self.count), self.longest
-        total = group_sum(weight, self.piece, n).clamp_min(1e-12)
-        mean = group_sum(weight[:, None] * point, self.piece, n)
-        mean = mean / total[:, None]
-        A = self.normal(weight) / total[:, None, None]
+        by_pair = self._by_pair(weight)
+        # B-splines sum up to one.
+        by_spline = by_pair.sum(-1)
+        total = by_spline.sum((1, 2)).clamp_min(1e-12)
+        pull = weight.new_zeros(*self.place.shape, 3)
+        for c, pulling in enumerate(weight * x for x in self.offset):
+            for a, w in enumerate(self.w):
+                pull[..., a, c] = self._by_segment(pulling * w)
+        mean = pull.sum((1, 2)) / total[:, None]
+        pull -= by_spline[..., None] * mean[:, None, None]
+        A = self._of_pieces(by_pair) / total[:, None, None]
         # A trace of bending keeps coefficients that no point holds on the line of the others.
-        A = A + (smoothing + 1e-9) * spline_fit.bending(self.count, k, point)
+        A = A + (smoothing + 1e-9) * spline_fit.bending(self.count, k, weight)
         unused = torch.arange(k, device=weight.device) >= self.count[:, None]
-        A = A + torch.diag_embed(torch.where(unused, 1.0, 1e-12).to(point))
-        pull = (weight[:, None] * self.w)[..., None] * (point - mean[self.piece])[:, None]
-        at = (self.piece[:, None] * k + self.slot).flatten()
-        rhs = point.new_zeros(n * k, 3).index_add(0, at, pull.flatten(0, 1)).reshape(n, k, 3)
+        A = A + torch.diag_embed(torch.where(unused, 1.0, 1e-12).to(weight))
+        at = self.place.flatten(1)[..., None].expand(-1, -1, 3)
+        rhs = weight.new_zeros(n, k, 3).scatter_add_(1, at, pull.flatten(1, 2))
         solution = torch.linalg.solve(A, rhs / total[:, None, None])
         of_row, rank = spline_basis.rows(self.count)
-        return solution[of_row, rank] + mean[of_row]
+        return solution[of_row, rank] + (mean + self.centre)[of_row]
 
-    def miss(
-        self, coefficient: Float[Tensor, "c 3"], point: Float[Tensor, "r 3"]
-    ) -> Float[Tensor, " r"]:
+    def miss(self, coefficient: Float[Tensor, "c 3"]) -> Float[Tensor, " r"]:
         """How far to the right of their pieces points are, in the top view [m]."""
-        around = coefficient[self.row][..., :2]
-        offset = point[:, :2] - (self.w[..., None] * around).sum(1)
-        tangent = torch.nn.functional.normalize((self.dw[..., None] * around).sum(1), dim=-1)
-        return offset[:, 0] * tangent[:, 1] - offset[:, 1] * tangent[:, 0]
+        row = spline_basis.starts(self.count)[:, None, None] + self.place
+        around = (coefficient[row] - self.centre[:, None, None])[..., :2].flatten(0, 1)
+        x, y = self.offset[:2]
+        ahead = right = torch.zeros_like(x)
+        for k, (w, dw) in enumerate(zip(self.w, self.dw, strict=True)):
+            at_x, at_y = (
+                c.contiguous().index_select(0, self.segment) for c in around[:, k].unbind(-1)
+            )
+            x, y = x - w * at_x, y - w * at_y
+            ahead, right = ahead + dw * at_y, right + dw * at_x
+        return (x * ahead - y * right) / torch.hypot(ahead, right).clamp_min(1e-12)
 
     def control_sigma(self, weight: Float[Tensor, " r"]) -> Float[Tensor, " c"]:
         """Standard deviations of control points for points with these inverse variances."""
         count, k = self.count, self.longest
         # A control point that no point holds is unsure by metres, not by infinity.
         inside = torch.arange(k, device=weight.device) < count[:, None]
-        A = self.normal(weight) + torch.diag_embed(torch.where(inside, 1 / 5.0**2, 1.0).to(weight))
+        A = self._of_pieces(self._by_pair(weight))
+        A = A + torch.diag_embed(torch.where(inside, 1 / 5.0**2, 1.0).to(weight))
         covariance = torch.linalg.inv(A)
         of_row, rank = spline_basis.rows(count)
         # What takes coefficients to the point at a knot: 1/6, 4/6, 1/6, and 1 at the ends.
@@ -302,15 +342,15 @@ class _Basis:
         return variance.clamp_min(0).sqrt()
 
 
-def _group_median(
-    value: Float[Tensor, " r"], group: Int[Tensor, " r"], count: int
-) -> Float[Tensor, " count"]:
-    order = value.argsort()
-    order = order[group[order].argsort(stable=True)]
-    number = torch.bincount(group, minlength=count)
-    middle = number.cumsum(0) - number + number // 2
-    at = order[middle.clamp_max(max(len(order) - 1, 0))] if len(order) else order
-    return value[at] if len(order) else value.new_zeros(count)
+def _medians(value: Float[Tensor, " r"], size: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """The upper median of each group, those of one adjacent; zero of none."""
+    ends = size.cumsum(0).tolist()
+    flat, found = value.cpu().numpy(), np.zeros(len(ends))
+    for group, (begin, end) in enumerate(pairwise((0, *ends))):
+        if end > begin:
+            middle = (end - begin) // 2
+            found[group] = np.partition(flat[begin:end], middle)[middle]
+    return torch.from_numpy(found).to(value)
 
 
 def _no_pieces(marker: Tensor, like: Tensor) -> LanePieces:
