@@ -59,9 +59,11 @@ def pairs_between(
         return empty, empty, a.new_zeros(0)
     tree_a, tree_b = (KDTree(p.detach().cpu().numpy()) for p in (a, b))
     pairs = tree_a.sparse_distance_matrix(tree_b, radius, output_type="ndarray")
-    pairs = pairs[np.lexsort((pairs["j"], pairs["i"]))]
-    row_a, row_b = (torch.as_tensor(pairs[name].astype(np.int64)) for name in ("i", "j"))
-    distance = torch.as_tensor(pairs["v"].copy()).to(a)
+    # One key for both rows: half the time of sorting by one and then by the other.
+    key = pairs["i"].astype(np.int64) * len(b) + pairs["j"]
+    order = np.argsort(key, kind="stable")
+    row_a, row_b = (torch.as_tensor(rows) for rows in np.divmod(key[order], len(b)))
+    distance = torch.as_tensor(pairs["v"][order]).to(a)
     return row_a.to(a.device), row_b.to(a.device), distance
 
 

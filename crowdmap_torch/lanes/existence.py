@@ -43,22 +43,24 @@ def expected_by_chance(
     place, _, piece = sample_flat(control, count, _STEP_M)
     inside = piece[1:] == piece[:-1]
     begin, end, piece = place[:-1][inside, :2], place[1:][inside, :2], piece[1:][inside]
-    way = torch.nn.functional.normalize(end - begin, dim=1)
+    middle, way = (begin + end) / 2, torch.nn.functional.normalize(end - begin, dim=1)
     half = (end - begin).norm(dim=1) / 2
-    reach = math.hypot(band, _STEP_M)
-    row, at, _ = pairs_between(point, (begin + end) / 2, radius=reach)
-    off = point[row] - ((begin + end) / 2)[at]
-    along = (off * way[at]).sum(1)
-    aside = (way[at, 0] * off[:, 1] - way[at, 1] * off[:, 0]).abs()
+    row, at, _ = pairs_between(point, middle, radius=math.hypot(band, _STEP_M))
+    # Column by column: pairs are many.
+    x, y = (p[row] - q[at] for p, q in zip(point.unbind(1), middle.unbind(1), strict=True))
+    way_x, way_y = (w[at] for w in way.unbind(1))
+    aside = (way_x * y - way_y * x).abs()
     first, last = _ends(detection)
     axis = torch.nn.functional.normalize(point[last] - point[first], dim=1)
+    axis_x, axis_y = (a[row] for a in axis.unbind(1))
     # One point has no direction: it may run any way.
-    runs = (axis[row] * way[at]).sum(1).abs() > _MAX_ANGLE_COS
+    runs = (axis_x * way_x + axis_y * way_y).abs() > _MAX_ANGLE_COS
     runs |= (first == last)[row]
-    used = (along.abs() <= half[at]) & (aside <= band) & runs
-    key = piece[at[used]] * (int(detection.max()) + 1) + detection[row[used]]
+    used = ((x * way_x + y * way_y).abs() <= half[at]) & (aside <= band) & runs
+    aside, row, at = aside[used], row[used], at[used]
+    key = piece[at] * (int(detection.max()) + 1) + detection[row]
     trial, group = torch.unique(key, return_inverse=True)
-    mean = group_sum(aside[used], group, len(trial)) / torch.bincount(group, minlength=len(trial))
+    mean = group_sum(aside, group, len(trial)) / torch.bincount(group, minlength=len(trial))
     of_piece = trial // (int(detection.max()) + 1)
     trials = torch.bincount(of_piece, minlength=n).to(control)
     agreeing = group_sum((mean <= near).to(control), of_piece, n)
