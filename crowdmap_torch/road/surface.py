@@ -41,14 +41,18 @@ class DriveSurface:
     node: Float[Tensor, "n 6"]
     """Station, place (3), direction of travel, slope to the right; by increasing station."""
 
-    def at(self, station: Float[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Place [p 3], direction of travel [p] and slope to the right [p] on the way, by linear interpolation."""
-        at = self.node[:, 0].contiguous()
+    def at(self, station: Float[Tensor, " p"]) -> tuple[Float[Tensor, "3 p"], Tensor, Tensor]:
+        """Place, direction of travel [p] and slope to the right [p] on the way, by linear interpolation."""
+        at, *columns = self.node.mT.contiguous()
         right = torch.searchsorted(at, station.detach().contiguous()).clamp(1, len(at) - 1)
-        low, high = self.node[right - 1], self.node[right]
-        share = ((station - low[:, 0]) / (high[:, 0] - low[:, 0])).clamp(0, 1)
-        row = low + share[:, None] * (high - low)
-        return row[:, 1:4], row[:, 4], row[:, 5]
+        left = right - 1
+        low = at.index_select(0, left)
+        share = ((station - low) / (at.index_select(0, right) - low)).clamp(0, 1)
+        found = []
+        for column in columns:
+            low = column.index_select(0, left)
+            found.append(low + share * (column.index_select(0, right) - low))
+        return torch.stack(found[:3]), found[3], found[4]
 
 
 @dataclass(frozen=True)
@@ -102,32 +106,30 @@ def intersect(
 
     `depth` is a first guess in units of the rays' length.
     """
-    origin = surface.centre[frame]
-    flat = ray_world[:, :2].norm(dim=-1)
-    station = surface.station[frame] + depth * flat
-    start = surface.station[frame]
+    # Column by column: points are many, and every operation runs along them.
+    origin, ray = (t.mT.contiguous() for t in (surface.centre[frame], ray_world))
+    start, slope = surface.station[frame], surface.slope[frame]
+    station = start + depth * torch.hypot(ray[0], ray[1])
     for _ in range(_STEPS):
-        point = origin + depth[:, None] * ray_world
+        x, y, z = torch.addcmul(origin, depth, ray)
         place, heading, cross = surface.at(station)
-        ahead = torch.stack((heading.cos(), heading.sin()), dim=-1)
-        gap = point[:, :2] - place[:, :2]
-        along = (gap * ahead).sum(-1)
-        offset = gap[:, 0] * ahead[:, 1] - gap[:, 1] * ahead[:, 0]
-        above = point[:, 2] - place[:, 2] - cross * offset - along * surface.slope[frame]
-        side = ray_world[:, 0] * ahead[:, 1] - ray_world[:, 1] * ahead[:, 0]
-        onward = (ray_world[:, :2] * ahead).sum(-1)
-        falling = -(ray_world[:, 2] - cross * side - surface.slope[frame] * onward)
+        c, s = heading.cos(), heading.sin()
+        x, y = x - place[0], y - place[1]
+        along = x * c + y * s
+        offset = x * s - y * c
+        above = z - place[2] - cross * offset - along * slope
+        falling = cross * (ray[0] * s - ray[1] * c) + slope * (ray[0] * c + ray[1] * s) - ray[2]
         step = above / torch.where(falling > 1e-3, falling, 1e-3)
         depth = (depth + step.clamp(-0.3 * depth, 0.3 * depth)).clamp_min(1e-3)
         station = station + along.clamp(-10, 10)
-    point = origin + depth[:, None] * ray_world
+    point = torch.addcmul(origin, depth, ray)
     place, heading, cross = surface.at(station)
-    gap = point[:, :2] - place[:, :2]
-    along = gap[:, 0] * heading.cos() + gap[:, 1] * heading.sin()
-    offset = gap[:, 0] * heading.sin() - gap[:, 1] * heading.cos()
-    above = point[:, 2] - place[:, 2] - cross * offset
+    x, y = point[:2] - place[:2]
+    along = x * heading.cos() + y * heading.sin()
+    offset = x * heading.sin() - y * heading.cos()
+    above = point[2] - place[2] - cross * offset
     is_met = (above.abs() < 0.02) & (along.abs() < 0.5) & (station > start)
-    return SurfacePoints(station, offset, point, depth, is_met)
+    return SurfacePoints(station, offset, point.mT.contiguous(), depth, is_met)
 
 
 def flattened_rays(
