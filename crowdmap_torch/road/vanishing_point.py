@@ -102,7 +102,7 @@ def fit_vanishing(
     near, far = config.range_m
     covariance = response = torch.zeros_like(shared[:, :, None])
     own = torch.zeros_like(offset)
-    for scale in config.scales:
+    for number, scale in enumerate(config.scales, 1):
         a, psi, kappa, rate = shared[frame].unbind(-1)
         m = offset[detection]
         depression = (y + a).clamp_min(height / (2 * far))
@@ -114,8 +114,10 @@ def fit_vanishing(
         whitened = residual.square() / variance
         weight = loss.weight(whitened / scale**2) / variance * used
         # Columns: alpha, psi, kappa, kappa'; then what a curved and a twisted road would add to
-        # alpha.
-        J = (by_y, -torch.ones_like(Z), -Z / 2, -(Z**2) / 6, by_y * Z / 2, by_y * x * Z)
+        # alpha, which is asked for at the end.
+        J = (by_y, -torch.ones_like(Z), -Z / 2, -(Z**2) / 6)
+        if number == len(config.scales):
+            J = (*J, by_y * Z / 2, by_y * x * Z)
         by_offset = -(y + a)
         A, B, C, shared_rhs, offset_rhs = _normal_equations(
             J, by_offset, residual, weight, detection, rays.frame, count, rays.frames
@@ -165,13 +167,14 @@ def _normal_equations(
     count: int,
     frames: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blocks of J^T W J, shared [f 6 6], mixed [d 6] and own [d], and the parts of -J^T W r; J by its columns."""
+    """Blocks of J^T W J, shared [f k k], mixed [d k] and own [d], and the parts of -J^T W r; J by its columns."""
     columns = (*J, by_offset, residual)
     size = len(columns)
     own = residual.new_zeros(size, size, count)
     # Of the symmetric matrices one half is summed up, number by number: products of all at once take three times as long.
     for i, pulling in enumerate(weight * column for column in columns):
-        for j in range(i, size):
+        # The square of the residual is of no use.
+        for j in range(i, size if i < size - 1 else 0):
             own[i, j].index_add_(0, detection, pulling * columns[j])
             own[j, i] = own[i, j]
     own = own.permute(2, 0, 1).contiguous()
