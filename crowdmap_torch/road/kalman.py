@@ -120,7 +120,7 @@ def filter_forward(
     for _ in range(len(m) + 1 if len(m) else 0):
         value = m.value - (m.known @ expected[..., None])[..., 0]
         steps = _filter_steps(F, Q, m.row, value, m.variance * inflation, first)
-        state = RoadState(*associative_scan(_one_after_another, steps)[1:3])
+        state = RoadState(*associative_scan(_one_after_another, steps, onto=_after_beginning)[:2])
         x, P = state.mean[:-1, :, None], state.covariance[:-1]
         predicted = RoadState(
             torch.cat((first.mean, (F[1:] @ x)[..., 0])),
@@ -166,8 +166,8 @@ def _filter_steps(
 ) -> Elements:
     """What each frame makes of the state x before it, one row a frame.
 
-    (A, b, C): its posterior is `A x + b` with covariance C; (eta, J): what it says of x, in information form. The first
-    frame's is the posterior itself, from what was predicted for it.
+    (b, C, A): its posterior is `A x + b` with covariance C; (eta, J): what it says of x, in information form. The first
+    frame's is the posterior itself, from what was predicted for it: A is zero, and of any beginning b and C are all.
     """
     P = torch.cat((first.covariance, Q[1:]))
     HP = H @ P
@@ -178,9 +178,9 @@ def _filter_steps(
     innovation = value[..., None] - H @ before[..., None]
     left = torch.eye(STATE_SIZE, dtype=F.dtype, device=F.device) - K @ H
     return (
-        left @ F,
         before + (K @ innovation)[..., 0],
         _symmetric(left @ P),
+        left @ F,
         (F.mT @ SH.mT @ value[..., None])[..., 0],
         _symmetric(F.mT @ H.mT @ SH @ F),
     )
@@ -188,20 +188,32 @@ def _filter_steps(
 
 def _one_after_another(earlier: Elements, later: Elements) -> Elements:
     """Two stretches of frames as one (Sarkka and Garcia-Fernandez 2021, Lemma 8)."""
-    A, b, C, eta, J = earlier
-    A_on, b_on, C_on, eta_on, J_on = later
+    b, C, A, eta, J = earlier
+    b_on, C_on, A_on, eta_on, J_on = later
     eye = torch.eye(STATE_SIZE, dtype=A.dtype, device=A.device)
     shifted = b + (C @ eta_on[..., None])[..., 0]
-    forward = A_on @ torch.linalg.solve(eye + C @ J_on, torch.cat((A, shifted[..., None], C), -1))
+    # I + J C of the way back is the transpose of I + C J.
+    found = torch.linalg.inv(eye + C @ J_on) @ torch.cat((A, shifted[..., None], C), -1)
+    forward = A_on @ found
     left = eta_on - (J_on @ b[..., None])[..., 0]
-    back = A.mT @ torch.linalg.solve(eye + J_on @ C, torch.cat((left[..., None], J_on @ A), -1))
+    back = found[..., :STATE_SIZE].mT @ torch.cat((left[..., None], J_on @ A), -1)
     return (
-        forward[..., :STATE_SIZE],
         forward[..., STATE_SIZE] + b_on,
         _symmetric(forward[..., STATE_SIZE + 1 :] @ A_on.mT) + C_on,
+        forward[..., :STATE_SIZE],
         back[..., 0] + eta,
         _symmetric(back[..., 1:]) + J,
     )
+
+
+def _after_beginning(beginning: Elements, later: Elements) -> Elements:
+    """The state (b, C) after a stretch that follows on a beginning."""
+    b, C = beginning[:2]
+    b_on, C_on, A_on, eta_on, J_on = later
+    eye = torch.eye(STATE_SIZE, dtype=C.dtype, device=C.device)
+    shifted = b[..., None] + C @ eta_on[..., None]
+    forward = A_on @ torch.linalg.solve(eye + C @ J_on, torch.cat((shifted, C), -1))
+    return forward[..., 0] + b_on, _symmetric(forward[..., 1:] @ A_on.mT) + C_on
 
 
 def _one_before_another(later: Elements, earlier: Elements) -> Elements:
