@@ -20,7 +20,11 @@ def fundamental(
     fundamental matrix of two cameras with K = I. Its norm is the baseline [m] times sqrt(2);
     without a baseline it is zero and says nothing.
     """
-    T_a_b = se3.inverse(T_world_a) @ T_world_b
+    return fundamental_of_motion(se3.inverse(T_world_a) @ T_world_b)
+
+
+def fundamental_of_motion(T_a_b: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """`fundamental` of two views of which the second has this pose in the first."""
     return se3.skew(T_a_b[..., :3, 3]) @ T_a_b[..., :3, :3]
 
 

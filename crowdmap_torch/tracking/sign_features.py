@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import correspondence, polygon, se3
-from crowdmap_torch.geometry.epipolar import fundamental
+from crowdmap_torch.geometry.epipolar import fundamental, fundamental_of_motion
 from crowdmap_torch.ranges import Cost, Count, Deviations, Length, Pixels, Settings, Sigma
 from crowdmap_torch.tables import Rows, SignDetections
 
@@ -210,8 +210,8 @@ def _blended_costs(
     rotation-compensated pixel distance takes over. Unlike the paper, the norm is Sampson's, whose cost is a distance in
     pixels wherever the epipolar line is, and the mean over vertices lets one threshold serve all shapes.
     """
-    F_ab = fundamental(a.T_world_camera, b.T_world_camera)
     T_a_b = se3.inverse(a.T_world_camera) @ b.T_world_camera
+    F_ab = fundamental_of_motion(T_a_b)
     height_px = (a.sighting[:, 2].exp() * a.focal + b.sighting[:, 2].exp() * b.focal) / 2
     motion_px = T_a_b[:, :3, 3].norm(dim=-1) * height_px / config.typical_height_m
     noise_sq = 4 * config.sigma_px**2
