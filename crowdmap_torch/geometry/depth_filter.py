@@ -21,7 +21,10 @@ from jaxtyping import Float
 
 _MEASURES = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
 """A sighting as a linear function of the state."""
-_IDENTITY = np.eye(4)
+_IDENTITY, _IDENTITY_3 = np.eye(4), np.eye(3)
+_NEARER_OR_SMALLER = np.array([[1.0, -1.0], [-1.0, 1.0]])
+_ON_DIAGONAL = slice(0, 11, 5)
+"""The first three of the diagonal among the 16 entries of a covariance."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,8 @@ def initial(
     mean[:, 2] = sighting[:, 2] - log_height
     mean[:, 3] = log_height
     covariance = np.zeros((n, 4, 4))
-    covariance[:, (0, 1, 2), (0, 1, 2)] = variance
-    covariance[:, 2:, 2:] += sigma_log_height**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    covariance.reshape(n, 16)[:, _ON_DIAGONAL] = variance
+    covariance[:, 2:, 2:] += sigma_log_height**2 * _NEARER_OR_SMALLER
     return DepthState(mean, covariance)
 
 
@@ -99,10 +102,10 @@ def predict(
     inverse_depth = np.exp(state.mean[:, 2:3])
     # The point and its derivatives, all scaled by its inverse depth in a: finite for things at infinity.
     by_state = R_b_a.copy()
-    by_state[..., 2] = inverse_depth * t_b_a
-    p = (
-        R_b_a[..., 0] * state.mean[:, :1] + R_b_a[..., 1] * state.mean[:, 1:2] + R_b_a[..., 2]
-    ) + by_state[..., 2]
+    by_state[..., 2] = moved = inverse_depth * t_b_a
+    ray = np.ones((len(moved), 3))
+    ray[:, :2] = state.mean[:, :2]
+    p = (R_b_a @ ray[..., None])[..., 0] + moved
     z = p[:, 2:]
     in_front = z > 1e-6
     z = np.where(in_front, z, 1.0)
@@ -120,9 +123,9 @@ def predict(
     now = inverse_depth / z
     by_position = now * now * variance_position[:, None]
     covariance = J @ state.covariance @ J.transpose(0, 2, 1)
-    bearing_noise = (by_position + variance_rotation[:, None]) * (1 + bearing * bearing)
-    covariance[:, (0, 1), (0, 1)] += bearing_noise
-    covariance[:, 2, 2] += by_position[:, 0]
+    diagonal = covariance.reshape(-1, 16)[:, _ON_DIAGONAL]
+    diagonal[:, :2] += (by_position + variance_rotation[:, None]) * (1 + bearing * bearing)
+    diagonal[:, 2:] += by_position
     return Prediction(
         state=DepthState(mean, covariance),
         depth=np.where(in_front, 1 / now, 0.0)[:, 0],
@@ -136,7 +139,7 @@ def innovation(
 ) -> Innovation:
     """Distances of all sightings from all predictions."""
     difference = sighting - prediction.expected[:, None]
-    S = prediction.spread[:, None] + variance[:, :, None] * np.eye(3)
+    S = prediction.spread[:, None] + variance[:, :, None] * _IDENTITY_3
     determinant = np.linalg.det(S)
     solved = (np.linalg.inv(S) @ difference[..., None])[..., 0]
     distance_sq = (difference * solved).sum(-1)
@@ -157,11 +160,11 @@ def update(
     """
     state = prediction.state
     difference = sighting - prediction.expected
-    inverse = np.linalg.inv(prediction.spread + variance[:, :, None] * np.eye(3))
-    distance_sq = np.einsum("ni,nij,nj->n", difference, inverse, difference)
+    inverse = np.linalg.inv(prediction.spread + variance[:, :, None] * _IDENTITY_3)
+    distance_sq = (difference * (inverse @ difference[..., None])[..., 0]).sum(-1)
     if (distance_sq > trusted**2).any():
         variance = variance * np.maximum(distance_sq / trusted**2, 1)[:, None]
-        inverse = np.linalg.inv(prediction.spread + variance[:, :, None] * np.eye(3))
+        inverse = np.linalg.inv(prediction.spread + variance[:, :, None] * _IDENTITY_3)
     gain = state.covariance @ _MEASURES.T @ inverse
     # Joseph's form stays symmetric and positive however small the noise.
     keep = _IDENTITY - gain @ _MEASURES

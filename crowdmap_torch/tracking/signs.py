@@ -79,7 +79,8 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
             return rows, rows
         old = self.active
         silent_for = features.frame[rows[0]] - features.frame[old.last]
-        old = old[silent_for <= self.config.window]
+        if silent_for.max(initial=0) > self.config.window:
+            old = old[silent_for <= self.config.window]
         sighting, variance = features.sighting[rows], features.variance[rows]
         prediction = self._predict(old, features, int(rows[0]))
         epipolar_px2 = pair_costs(old.last[:, None], rows[None])
@@ -100,10 +101,11 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
             log_height=math.log(self.config.typical_height_m),
             sigma_log_height=self.config.sigma_log_height,
         )
-        updated = depth_filter.update(
-            prediction[row], sighting[column], variance[column], trusted=TRUSTED_SIGMAS
-        )
-        state.mean[column], state.covariance[column] = updated.mean, updated.covariance
+        if len(row):
+            updated = depth_filter.update(
+                prediction[row], sighting[column], variance[column], trusted=TRUSTED_SIGMAS
+            )
+            state.mean[column], state.covariance[column] = updated.mean, updated.covariance
         now = ActiveSigns(label, rows, votes, shift, state.mean, state.covariance)
         self.active = old.without(row).followed_by(now)
         return label, shift
