@@ -10,7 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import distinct_pairs, group_range, group_sum
+from crowdmap_torch.clustering.groups import (
+    distinct_pairs,
+    group_count,
+    group_median,
+    group_range,
+    group_sum,
+)
 from crowdmap_torch.geometry import spline_basis, spline_fit
 from crowdmap_torch.optim.robust import Tukey
 
@@ -18,6 +24,12 @@ _CELL_M = 2.0
 """Places that a marker was seen from are counted over stretches of this length [m]."""
 _VIEW_M = 0.5
 """Places nearer to each other are one [m]."""
+_LEAST_GAP_M = 3.0
+"""Points of a marker, or of a dash, are nearer to each other [m]."""
+_LEAST_GAPS = 3
+"""As many gaps of a marker tell how far its dashes are apart."""
+_USUAL_GAP = 1.3
+"""Gaps between dashes are at most so much longer than the usual one: points stop short of the ends of dashes."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +76,13 @@ class LaneFit:
 
 
 def runs_of(
-    marker: Int[Tensor, " p"], along: Float[Tensor, " p"], max_gap: float
+    marker: Int[Tensor, " p"], along: Float[Tensor, " p"], max_gap: float | Float[Tensor, " p"]
 ) -> Int[Tensor, " p"]:
     """Points of one marker numbered by runs without a gap longer than `max_gap` [m] along it."""
-    order = along.argsort()
-    order = order[marker[order].argsort(stable=True)]
+    order, ahead, same = _in_order(marker, along)
+    most = max_gap[order][1:] if isinstance(max_gap, Tensor) else along.new_tensor(max_gap)
     new = torch.ones_like(order, dtype=torch.bool)
-    ahead = along[order][1:] - along[order][:-1]
-    new[1:] = (marker[order][1:] != marker[order][:-1]) | (ahead > max_gap)
+    new[1:] = ~same | (ahead > most)
     return torch.empty_like(order).index_put((order,), new.cumsum(0) - 1)
 
 
@@ -79,7 +90,7 @@ def runs_in_plane(
     marker: Int[Tensor, " p"],
     along: Float[Tensor, " p"],
     point: Float[Tensor, "p 2"],
-    max_gap: float,
+    max_gap: float | Float[Tensor, " p"],
 ) -> Int[Tensor, " p"]:
     """Points of one marker numbered by runs without a longer gap [m] along the car's way, nor along their own axis.
 
@@ -89,6 +100,32 @@ def runs_in_plane(
     if not len(run):
         return run
     return runs_of(run, spline_fit.along_principal_axis(point, run, int(run.max()) + 1), max_gap)
+
+
+def dash_gap(
+    marker: Int[Tensor, " p"], along: Float[Tensor, " p"], most: float
+) -> Float[Tensor, " p"]:
+    """The longest gap [m] between dashes of each point's marker, `most` at most; 0 where it has no rhythm.
+
+    An intersection is one gap among others: it does not move the usual one.
+    """
+    if not len(marker):
+        return torch.zeros_like(along)
+    order, ahead, same = _in_order(marker, along)
+    is_gap, count = same & (ahead > _LEAST_GAP_M), int(marker.max()) + 1
+    of = marker[order][1:][is_gap]
+    longest = (_USUAL_GAP * group_median(ahead[is_gap], of, count)).clamp_max(most)
+    return torch.where(group_count(of, count) >= _LEAST_GAPS, longest, 0.0)[marker]
+
+
+def _in_order(
+    marker: Int[Tensor, " p"], along: Float[Tensor, " p"]
+) -> tuple[Int[Tensor, " p"], Float[Tensor, " s"], Bool[Tensor, " s"]]:
+    """Points by marker and along it; how far each lies from the one before, and whether both are of one marker."""
+    order = along.argsort()
+    order = order[marker[order].argsort(stable=True)]
+    of = marker[order]
+    return order, along[order][1:] - along[order][:-1], of[1:] == of[:-1]
 
 
 def well_seen(

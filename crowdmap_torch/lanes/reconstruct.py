@@ -22,6 +22,7 @@ from crowdmap_torch.lanes.pieces import (
     LanePieces,
     cut_by_length,
     cut_by_number,
+    dash_gap,
     fit_pieces,
     runs_in_plane,
     well_seen,
@@ -118,6 +119,8 @@ class LaneConfig(Settings):
     max_gap_m: Length = 12.0
     """A marker without points over a longer way ends, and begins again behind it: dashes are bridged,
     intersections are not."""
+    max_dash_gap_m: Length = 20.0
+    """Dashes further apart are bridged up to this length, where a marker's gaps are usually as long."""
     noise_px: Pixels = 1.0
     """1-sigma of lane points."""
     normal_sigma: Sigma = 1.5e-3
@@ -232,9 +235,10 @@ def _pieces(
 ) -> tuple[LanePieces, LaneFit]:
     """Splines through pieces of equal length, points weighed by their noise, outliers left out."""
     along = _along(ground, marker)
+    max_gap = dash_gap(marker, along, config.max_dash_gap_m).clamp_min(config.max_gap_m)
     pieces = cut_by_length(
         marker,
-        runs_in_plane(marker, along, ground.point_world[:, :2], config.max_gap_m),
+        runs_in_plane(marker, along, ground.point_world[:, :2], max_gap),
         along,
         length=config.piece_m,
         overlap=config.overlap,

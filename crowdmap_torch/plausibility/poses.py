@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
@@ -257,9 +257,9 @@ def _axes(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
         yield Finding(
             "axes",
             _seen(journey, limits),
-            "poses, mount and camera do not fit each other",
-            "poses are T_world_link of the mount's pose_link, quaternions qx qy qz qw; the "
-            "camera's x is right, y down, z ahead",
+            "the camera looks aside or back, or poses, mount and camera do not fit each other",
+            "nothing, if it is mounted so; else: poses are T_world_link of the mount's pose_link, "
+            "quaternions qx qy qz qw; the camera's x is right, y down, z ahead",
         )
 
 
@@ -340,6 +340,8 @@ def _instead(journey: Journey) -> Iterator[tuple[float, Finding, Float[Tensor, "
     for kind, cause, cure, axes in named:
         body = se3.make(R.new_tensor(axes), p.new_zeros(3))
         yield 0.0, Finding(kind, "", cause, cure, repair=_axes_repair(same, axes)), T @ body
+        if kind == "camera-axes":
+            continue  # Upright, looking back: a rear camera is likelier than two mistakes.
         # Of a car that drives north-east the one looks like the other.
         both = replace(
             down,
@@ -367,7 +369,8 @@ def _links(journey: Journey) -> Float[Tensor, "f 4 4"]:
 
 def _misfit(T_world_camera: Float[Tensor, "f 4 4"], limits: PoseLimits) -> float | None:
     """How far the camera is from looking ahead and standing upright, 1 at the limit; None if it stands still."""
-    if _way(T_world_camera) < 3 * limits.baseline_m:
+    moves = bool(_motion(T_world_camera, limits)[1].any())
+    if not moves or _way(T_world_camera) < 3 * limits.baseline_m:
         return None
     axis, down = _angles(T_world_camera, limits)
     return max(axis / limits.axis_deg, down / limits.upright_deg)
@@ -375,14 +378,24 @@ def _misfit(T_world_camera: Float[Tensor, "f 4 4"], limits: PoseLimits) -> float
 
 def _angles(T_world_camera: Float[Tensor, "f 4 4"], limits: PoseLimits) -> tuple[float, float]:
     """Median angles [deg] of optical axis to motion, and of the image's down to the world's."""
+    motion, moves = _motion(T_world_camera, limits)
+    axis = (T_world_camera[:, :3, 2] * torch.nn.functional.normalize(motion, dim=-1)).sum(-1)
+    down = -T_world_camera[:, 2, 1]
+    return _degrees(axis[moves]), _degrees(down)
+
+
+def _motion(
+    T_world_camera: Float[Tensor, "f 4 4"], limits: PoseLimits
+) -> tuple[Float[Tensor, "f 3"], Bool[Tensor, " f"]]:
+    """Where the camera is a baseline's way after each frame, seen from there, and whether it has moved.
+
+    Of a car that stands positions tremble: that way adds up, and leads nowhere.
+    """
     p = T_world_camera[:, :3, 3]
     station = torch.cat((p.new_zeros(1), p.diff(dim=0).norm(dim=-1).cumsum(0)))
     ahead = torch.searchsorted(station, station + limits.baseline_m)
-    has = ahead < len(p)
-    motion = torch.nn.functional.normalize(p[ahead[has]] - p[has], dim=-1)
-    axis = (T_world_camera[has, :3, 2] * motion).sum(-1)
-    down = -T_world_camera[:, 2, 1]
-    return _degrees(axis), _degrees(down)
+    motion = p[ahead.clamp_max(len(p) - 1)] - p
+    return motion, (ahead < len(p)) & (motion.norm(dim=-1) > limits.baseline_m / 2)
 
 
 def _degrees(cosine: Float[Tensor, " f"]) -> float:

@@ -9,6 +9,7 @@ from crowdmap_torch.geometry import spline_fit
 from crowdmap_torch.lanes.pieces import (
     cut_by_length,
     cut_by_number,
+    dash_gap,
     fit_pieces,
     runs_in_plane,
     runs_of,
@@ -45,6 +46,34 @@ def test_a_gap_is_as_long_as_on_the_road_where_the_car_turns(turn: float) -> Non
     # A gap of dashes that is shorter stays bridged.
     dashed = torch.where(x < 20, x, x - 11)[:, None] * way.double()
     assert int(runs_in_plane(marker, along, dashed, 12.0).max()) == 0
+
+
+@pytest.mark.parametrize(("dash", "gap"), [(3.0, 9.15), (6.0, 12.0), (8.0, 12.0)])
+def test_dashes_of_a_motorway_are_one_run_and_crossings_are_not(
+    dash: float, gap: float, generator: torch.Generator
+) -> None:
+    """Dashes and gaps of the USA, Germany and Japan; points stop short of the ends of dashes."""
+    first = torch.arange(10, dtype=F64)[:, None] * (dash + gap)
+    along = first + dash * torch.rand(10, 30, dtype=F64, generator=generator)
+    crossing = 2.0 * gap
+    along = torch.cat((along.flatten(), along.flatten() + first[-1] + dash + crossing))
+    marker = torch.zeros(len(along), dtype=torch.int64)
+    max_gap = dash_gap(marker, along, 20.0).clamp_min(12.0)
+    run = runs_in_plane(marker, along, torch.stack((along, 0 * along), dim=1), max_gap)
+    assert len(run.unique()) == 2
+    assert len(run[:300].unique()) == len(run[300:].unique()) == 1
+
+
+def test_only_gaps_that_come_again_are_between_dashes() -> None:
+    solid = torch.arange(0, 40, 0.5).double()
+    twice = torch.cat((solid, solid + 55, solid + 110))
+    marker = torch.tensor([1, 3]).repeat_interleave(torch.tensor([len(twice), 5]))
+    along = torch.cat((twice, torch.arange(5) * 40.0))
+    longest = dash_gap(marker, along, 20.0)
+    assert not bool(longest[: len(twice)].any())
+    # However alike, gaps of forty metres are none between dashes.
+    assert longest[len(twice) :].tolist() == [20.0] * 5
+    assert len(dash_gap(marker[:0], along[:0], 20.0)) == 0
 
 
 def test_what_one_detection_of_many_shows_is_not_well_seen() -> None:

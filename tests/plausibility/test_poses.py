@@ -49,6 +49,25 @@ def test_a_camera_that_looks_aside_is_named_without_a_cause() -> None:
     assert kinds(turned) == ["axes"]
 
 
+@pytest.mark.parametrize("heading_deg", range(-180, 180, 30))
+def test_a_rear_camera_is_not_taken_for_two_mistakes_at_once(heading_deg: int) -> None:
+    """Another world and another camera's axes together would look back as well: `--fix` would turn all poses over."""
+    journey = drive(torch.linspace(0, 0.5, 60).double() + math.radians(heading_deg))
+    back = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]).double())
+    turned = replace(journey, T_world_camera=journey.T_world_camera @ back)
+    (found,) = pose_findings(turned, ORIGIN)
+    assert found.kind == "axes" and found.repair is None
+
+
+def test_a_car_that_waits_longer_than_it_drives_looks_ahead(generator: torch.Generator) -> None:
+    """Positions that tremble by 2 cm at a standstill go on for metres, in no direction."""
+    moving = drive(torch.zeros(60).double()).T_world_camera
+    trembling = moving[-1:].repeat(600, 1, 1)
+    trembling[:, :3, 3] += 0.02 * torch.randn(600, 3, dtype=torch.float64, generator=generator)
+    assert kinds(make_journey(RIG, torch.cat((moving, trembling)))) == []
+    assert kinds(make_journey(RIG, trembling)) == []
+
+
 def test_a_leap_is_named_with_its_frames() -> None:
     journey = drive(torch.zeros(60).double())
     T = journey.T_world_camera.clone()
