@@ -39,7 +39,7 @@ class AdjustConfig(Settings):
         default_factory=lambda: lm.LmConfig(
             max_iterations=30,
             cost_tolerance=5e-5,
-            move_tolerance=0.03,
+            move_tolerance=0.05,
             initial_damping=1e-9,
             max_stretch=3.0,
             corrections=8,
