@@ -45,6 +45,8 @@ class TilePattern:
     width: int
     present: Bool[Tensor, "t t"]
     """Above the diagonal, and on it; the diagonal's are all there."""
+    upper: NDArray[np.bool_]
+    """The same on the CPU."""
 
     @classmethod
     def of(
@@ -53,7 +55,7 @@ class TilePattern:
         """That of tiles of which those above the diagonal count."""
         upper = np.triu(present)
         np.fill_diagonal(upper, val=True)
-        return cls(dim, width, torch.from_numpy(upper).to(device))
+        return cls(dim, width, torch.from_numpy(upper).to(device), upper)
 
     @property
     def tiles(self) -> int:
@@ -63,12 +65,12 @@ class TilePattern:
     @cached_property
     def count(self) -> int:
         """All tiles."""
-        return int(self.present.sum())
+        return int(self.upper.sum())
 
     @cached_property
     def columns(self) -> tuple[tuple[int, ...], ...]:
         """By row, the columns of the tiles right of the diagonal."""
-        return tuple(tuple(np.nonzero(row)[0][1:].tolist()) for row in self.present.cpu().numpy())
+        return tuple(tuple(np.nonzero(row)[0][1:].tolist()) for row in self.upper)
 
     @cached_property
     def number(self) -> tuple[dict[int, int], ...]:
@@ -87,7 +89,7 @@ class TilePattern:
     @cached_property
     def base(self) -> Int[Tensor, "u u"]:
         """Where in memory each tile begins, and the right-hand side's and what is forgotten; in 32 bits if they do."""
-        upper, tiles, area = self.present.cpu().numpy(), self.tiles, self.width**2
+        upper, tiles, area = self.upper, self.tiles, self.width**2
         behind = self.count * area
         forgotten = behind + tiles * self.width
         most = max(forgotten + (tiles + 2) * area, (tiles + 2) ** 2)
@@ -106,7 +108,7 @@ class TilePattern:
 
     def filled(self) -> TilePattern:
         """That of the Cholesky factor: a row leaves its tiles behind in the row of the first of them."""
-        upper = self.present.cpu().numpy().copy()
+        upper = self.upper.copy()
         for row in range(len(upper)):
             right = np.nonzero(upper[row, row + 1 :])[0]
             if len(right):
