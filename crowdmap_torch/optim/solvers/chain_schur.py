@@ -60,6 +60,7 @@ from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.optim.solvers.windows import Batch, Round
+from crowdmap_torch.optim.solvers.workspace import Factor, Workspace
 from crowdmap_torch.processes.threads import in_order
 
 _NEXT_TO_NOTHING = 1e-6
@@ -127,62 +128,10 @@ class ChainBackend:
                 k = problem.variables[self.plan.chains].tangent_dim
                 # The old one goes before the new one comes.
                 self._workspace = None
-                self._workspace = Workspace(self._structure, block.new_empty(0, k))
+                self._workspace = Workspace.of(self._structure, block.new_empty(0, k))
             self._pattern = SparsityPattern.of(problem, values)
         assert self._structure is not None and self._workspace is not None
         return self._structure, self._workspace
-
-
-@dataclass
-class Workspace:
-    """What the solves of one back end share; memory is taken once, by parts of a sum each time: others need it meanwhile."""
-
-    structure: ChainStructure = field(repr=False)
-    like: Float[Tensor, "0 k"] = field(repr=False)
-    """Nothing, as wide as eliminated blocks, with the device and the type of all."""
-    couplings: dict[str, Float[Tensor, "f w _"]] = field(default_factory=dict)
-    """Of the last normal equations, by term."""
-    factor: Factor | None = None
-    """Of the last solve."""
-    _kept: tuple[TileMatrix, Tensor] | None = field(default=None, repr=False)
-
-    def room(self) -> tuple[TileMatrix, Float[Tensor, "rows k"]]:
-        """Zeros for the reduced system, and a store, whatever is in it.
-
-        The store has, per eliminated block and column of its window, a row of `k`, by when it is eliminated; part after part
-        in the same.
-        """
-        if self._kept is not None:
-            self._kept[0].flat.zero_()
-            return self._kept
-        structure, like = self.structure, self.like
-        system = TileMatrix.zeros(structure.reduced, like)
-        found = system, like.new_empty(structure.store_rows + 1, like.shape[1])
-        if structure.plan.is_whole:
-            self._kept = found
-        return found
-
-    def coupling(self, name: str, shape: tuple[int, ...]) -> Float[Tensor, "f w _"]:
-        """Memory for a term's coupling; what is in it is of no account."""
-        if name not in self.couplings or self.couplings[name].shape != shape:
-            self.couplings[name] = self.like.new_empty(shape)
-        return self.couplings[name]
-
-
-@dataclass(frozen=True)
-class Factor:
-    """The factorised matrix."""
-
-    leads: tuple[tuple[Lead, ...], ...]
-    """By part and round."""
-    reduced: TiledCholesky | None
-    """Of S; None where S is a part of a sum."""
-    of: Float[Tensor, "e k"]
-    """The gradient a of the equations that they are of."""
-    is_undamped: bool
-    """Whether next to nothing was added to the diagonals."""
-    added: Float[Tensor, " r"]
-    """What was added to that of C."""
 
 
 @dataclass(frozen=True)
@@ -312,7 +261,7 @@ class ChainNormalEquations:
         self.hessian.add_to(system)
         system.right_side.copy_(self.gradient)
         if added_y is not None:
-            system.add_diagonal(added_y)
+            system.add_diagonal(added_y + structure.where.gaps)
         products = Products(system)
         leads = tuple(self._eliminate(part, added_x, products, store) for part in structure.parts)
         products.subtract()

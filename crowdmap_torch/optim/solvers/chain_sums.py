@@ -135,7 +135,7 @@ class ReducibleSums(ChainSums):
         """Adds the blocks between two variables that stay."""
         where, (name, block), (name_of_other, block_of_other) = self.structure.where, one, other
         row, column = where.offset[name][block], where.offset[name_of_other][block_of_other]
-        self._between.append(Between(row, column, square, where.dim).joined())
+        self._between.append(Between(row, column, square).joined(where.dim))
 
     def add_lots(self) -> None:
         """Adds what was summed by lot, once all rows are there."""
@@ -148,8 +148,7 @@ class ReducibleSums(ChainSums):
         """The matrix C."""
         where = self.structure.where
         own = {name: self.by_variable.hessian(name) for name in where.offset}
-        # Of a sum's parts none has what is nobody's column: the sum has it once.
-        return StayingBlocks(where, own, tuple(self._between), self.structure.plan.is_whole)
+        return StayingBlocks(where, own, tuple(self._between))
 
     def gradient_of_stays(self) -> Float[Tensor, " r"]:
         """The gradient b."""

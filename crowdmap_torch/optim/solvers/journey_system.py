@@ -130,15 +130,12 @@ class Summed:
     factor: TiledCholesky | None = None
     added: Float[Tensor, " r"] | None = None
     """To the diagonal of C."""
-    gap: Float[Tensor, " r"] | None = None
-    """Ones where a column is nobody's, which stands for itself."""
 
     def make_room(self, own: ChainNormalEquations, tiles: Iterator[Int[Tensor, "n 2"]]) -> None:
         """Memory for the sum of systems with these tiles, unless it is there already."""
         # The last factors are in the same memory.
         self.factor = None
         pattern = own.structure.reduced
-        self.gap = (~own.structure.where.used[0]).to(own.gradient)
         present = torch.zeros_like(pattern.present)
         for tile in tiles:
             row, column = tile.long().unbind(1)
@@ -158,13 +155,13 @@ class Summed:
         self, added: Float[Tensor, " r"], parts: Iterator[JourneySystem]
     ) -> Float[Tensor, " r"] | None:
         """The right-hand side of the sum, which is factorised; None: it is not positive definite."""
-        system, gap = self.system, self.gap
-        assert system is not None and gap is not None, "of the leader"
+        system = self.system
+        assert system is not None, "of the leader"
         self.factor = None
         system.flat.zero_()
         for part in parts:
             part.add_to(system)
-        system.add_diagonal(added + gap)
+        system.add_diagonal(added)
         self.factor, self.added = TiledCholesky.of(system), added
         return None if self.factor is None else system.right_side
 
@@ -198,7 +195,7 @@ class JourneyEquations:
         added_y = damping * self.diagonal.clamp_min(DIAGONAL_FLOOR)
 
         def stepped(parts: Iterator[JourneySystem]) -> tuple[Tensor, Tensor] | None:
-            right_side = self.summed.factorise(added_y, parts)
+            right_side = self.summed.factorise(added_y + own.structure.where.gaps, parts)
             if right_side is None:
                 return None
             y = -self.summed.solve(right_side)
@@ -257,8 +254,8 @@ class JourneyEquations:
     def share_covariance(self, *, floor: float = UNOBSERVED_FLOOR) -> None:
         """Brings one's own summand of what is undamped to the leader, which factors the sum."""
         own = self.own
-        added = torch.zeros_like(self.gradient)
-        added[: own.structure.border_begin] = floor
+        added = own.structure.where.gaps.to(self.gradient)
+        added[: own.structure.border_begin] += floor
 
         def factored(parts: Iterator[JourneySystem]) -> bool:
             return self.summed.factorise(added, parts) is not None

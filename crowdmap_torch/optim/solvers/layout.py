@@ -22,7 +22,12 @@ class Layout:
     tangent_dim: Mapping[str, int]
     dim: int
     used: Bool[Tensor, "groups dim"]
-    """False for the padding of groups with fewer unknowns than the largest."""
+    """False for the padding of groups with fewer unknowns than the largest, and in gaps between sections."""
+
+    @property
+    def gaps(self) -> Bool[Tensor, " dim"]:
+        """What is nobody's column, of one problem: on the diagonal of what is factored it stands for itself."""
+        return ~self.used[0]
 
     def in_order(
         self, block: Int[Tensor, " q"], section: Int[Tensor, " q"] | None = None, grid: int = 1

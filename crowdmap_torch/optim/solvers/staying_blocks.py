@@ -21,18 +21,16 @@ class Between(NamedTuple):
     column: Int[Tensor, " m"]
     """First row and first column of each."""
     square: Float[Tensor, "k l m"]
-    stride: int
-    """Columns of the matrix."""
 
-    def joined(self) -> Between:
-        """The same with neighbours of one place added up."""
-        key = self.row * self.stride + self.column
+    def joined(self, dim: int) -> Between:
+        """The same with neighbours of one place added up, in a matrix of so many columns."""
+        key = self.row * dim + self.column
         at, of = torch.unique_consecutive(key, return_inverse=True)
         if len(at) == len(key):
             return self
         total = self.square.new_zeros(*self.square.shape[:2], len(at))
         total.index_add_(2, of, self.square)
-        return Between(at // self.stride, at % self.stride, total, self.stride)
+        return Between(at // dim, at % dim, total)
 
 
 @dataclass(frozen=True)
@@ -43,29 +41,24 @@ class StayingBlocks:
     own: Mapping[str, Float[Tensor, "n k k"]]
     """Of every block with itself, by variable."""
     between: tuple[Between, ...]
-    has_gaps: bool
-    """Whether what is nobody's column stands for itself."""
 
     def diagonal(self) -> Float[Tensor, " r"]:
         """Its diagonal."""
         own = {name: square.diagonal(dim1=1, dim2=2) for name, square in self.own.items()}
         total = self.where.pack(own)[0]
-        for row, column, square, _ in self.between:
+        for row, column, square in self.between:
             # A row may touch a block twice.
             twice = torch.nonzero(row == column)[:, 0]
             of_twice = square[..., twice].diagonal()
             at = row[twice, None] + torch.arange(of_twice.shape[1], device=row.device)
             total.index_add_(0, at.flatten(), 2 * of_twice.flatten())
-        return total + (~self.where.used[0]).to(total) if self.has_gaps else total
+        return total
 
     def add_to(self, system: TileMatrix) -> None:
         """Adds it to a matrix that has tiles for it, in place."""
         for name, square in self.own.items():
             offset = self.where.offset[name]
             system.add(offset, offset, square.permute(1, 2, 0))
-        for row, column, square, _ in self.between:
+        for row, column, square in self.between:
             system.add(row, column, square)
             system.add(column, row, square.transpose(0, 1))
-        if self.has_gaps:
-            gap = torch.nonzero(~self.where.used[0])[:, 0]
-            system.add(gap, gap, system.flat.new_ones(1, 1, len(gap)))
