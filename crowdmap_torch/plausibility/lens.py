@@ -353,11 +353,11 @@ def _problem(
 def _solved(problem: Problem, values: dict[str, Tensor], seen: _Seen) -> MissingLens:
     backend = BandBackend("path")
     state = lm.solve(problem, values, _LM, backend=backend)
-    # The share is the same at every knot.
-    first = seen.views.sign.new_zeros(1)
+    # The share is the same at every knot. It is read where a sign is seen from: the inverse is filled from one to the other.
+    sign, knot = (block[:1] for _, block in problem.terms["view"].slots[:2])
     of_outline, of_path = seen.point.new_zeros(1, 1, 3 * _POINTS), seen.point.new_zeros(1, 1, 7)
     of_path[..., 6] = 1
-    share = LinearFunctions((("outline", first), ("path", first)), (of_outline, of_path))
+    share = LinearFunctions((("outline", sign), ("path", knot)), (of_outline, of_path))
     variance = backend.assemble(problem, state.values).covariance().of(share)[0, 0, 0]
     error = residuals(problem.terms["view"], state.values)
     noisier = (error.square().sum(1) / seen.numbers).median().clamp_min(_LEAST_NOISE)
