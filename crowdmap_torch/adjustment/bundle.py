@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from crowdmap_torch.adjustment import calibration_priors
 from crowdmap_torch.adjustment.bundle_state import BundleState
 from crowdmap_torch.adjustment.calibration_scales import rescaled as rescaled_calibrations
 from crowdmap_torch.adjustment.config import AdjustConfig
@@ -48,7 +49,7 @@ _SCALE_STAYS = 0.005
 """A scale of the prior that would change by less than this share stays as it is: the cost is to fall from step to step."""
 _SCALE_RESTS = 0.05
 """Scales of the prior of which none would change by more than this share are at rest: they are not known any better."""
-_CALIBRATION_RESTS = 0.2
+_CALIBRATIONS = (_SCALE_STAYS, 0.2)
 """Likewise of calibrations, which rest on few numbers: a fifth of a prior's sigma moves a map by nothing that shows."""
 _TOLD_HOLDS = 0.02
 """What observations tell of poses' errors is found anew where any scale has changed by more than this share since."""
@@ -139,9 +140,10 @@ class Bundle(BundleState):
                 self.poses_left.copy_(evidence.left)
             at_rest &= self._rescale_noise(values, evidence)
         if of_border is not None:
-            scaled = self.fleet, values, of_border, self.calibration_scale
-            found = self.together.of_all(lambda: rescaled_calibrations(*scaled))
-            at_rest &= self._follow("calibration_scale", found, _SCALE_STAYS, _CALIBRATION_RESTS)
+            scaled = self.fleet, values, of_border, self.calibration_scales
+            of_cars = self.together.of_all(lambda: rescaled_calibrations(*scaled))
+            at_rest &= self._follow("calibration_scale", of_cars.of_kind, *_CALIBRATIONS)
+            at_rest &= self._follow("calibration_far", of_cars.far, *_CALIBRATIONS)
         found = self.together.of_all(
             lambda drift: self.whole.prior.rescaled(drift, self.prior_scale, self.drift_told),
             values["drift"],
@@ -288,7 +290,7 @@ class Bundle(BundleState):
             self.refresh()
         terms = self.prior.terms(prior_scale, self.white_scale)
         if self.together.leads:
-            terms |= self.fixed | self.fleet.priors(self.calibration_scale)
+            terms |= self.fixed | calibration_priors.priors(self.fleet, self.calibration_scales)
             terms |= size_class_term(self.values()["size"], self.config)
         terms["pose_white"] = self.fleet.of_poses(terms["pose_white"], self._by_mount)
         terms.update(self._corner_term(self.corner_sigma()))

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from crowdmap_torch.adjustment.calibration import ByOptics
+from crowdmap_torch.adjustment.calibration_priors import CalibrationScales
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.cuts import convoys
 from crowdmap_torch.adjustment.lane_matching import LaneMatches
@@ -56,6 +57,8 @@ class BundleState(nn.Module):
     """By journey, how far the noise of positions and of rotations from frame to frame is from that of `prior`."""
     calibration_scale: Tensor
     """By kind of what cars may have wrong, how far they are from the sigmas of `fleet`."""
+    calibration_far: Tensor
+    """By car and number, how far beyond that it is."""
     drift_told: Tensor
     """By journey and number of a pose, the share of the drift's changes that observations tell."""
     poses_left: Tensor
@@ -101,6 +104,9 @@ class BundleState(nn.Module):
         )
         self.register_buffer("white_scale", torch.ones_like(values["bias"][:, :2]))
         self.register_buffer("calibration_scale", self.scale.new_ones(len(self.fleet.kinds)))
+        numbers = sum(self.variables[name].tangent_dim for name in self.fleet.variables)
+        far = self.scale.new_ones(len(self.fleet.vehicles), numbers)
+        self.register_buffer("calibration_far", far)
         self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
         self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
         self.register_buffer("told_at", torch.full_like(self.scales(), torch.nan))
@@ -190,6 +196,11 @@ class BundleState(nn.Module):
         )
         self.corners, self.lane_points = found.corners, found.lane_points
         self._by_optics = (found.by_corner, found.by_lane_point)
+
+    @property
+    def calibration_scales(self) -> CalibrationScales:
+        """How far cars are from the sigmas of `fleet`."""
+        return CalibrationScales(self.calibration_scale, self.calibration_far)
 
     @property
     def detections(self) -> CornerDetections:

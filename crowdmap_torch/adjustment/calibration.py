@@ -12,13 +12,6 @@ What is left out is how the calibration changes the derivatives by poses and lan
 are in units of their prior sigmas. A car is a `vehicle_id`, or else a rig. A load presses a car down for one drive: what
 was seen from it tells the drive's height to millimetres, and the car's own, which its drives have about, no better than
 loads differ.
-
-Cars that run the same programs err alike: of the prior's variance of clocks, read-outs and detectors they have a share
-in common, x_c = m + d_c with m ~ N(0, share) and d_c ~ N(0, 1 - share). With m marginalised, that of V cars is one row
-for each and one for each pair of them,
-
-    sum_c x_c^2 / (1 - share + V share) + sum_c<d (x_c - x_d)^2 / s^2
-    V / s^2 = 1 / (1 - share) - 1 / (1 - share + V share)
 """
 
 from __future__ import annotations
@@ -39,14 +32,11 @@ from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.ranges import Degrees, LengthOrNone, PixelsOrNone, Settings, Share
 from crowdmap_torch.residuals.calibration import with_linear_part
-from crowdmap_torch.residuals.pose import gauss_markov_start
 from crowdmap_torch.residuals.reprojection import pixel_error_jacobian
 from crowdmap_torch.tables import Journey
 
 _SUREST = 1e-3
 """Least share of the configuration's sigma that what was found before counts with."""
-_LEAST_APART = 1e-6
-"""Share of the variance that cars have to themselves where all of it is said to be common."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +107,7 @@ OPTICS = (
 """What moves the image, and the road under it."""
 VARIABLES = {"mount": MOUNT, "optics": OPTICS}
 """The unknowns of every car, by variable of the bundle."""
-_LOAD = "load"
+LOAD = "load"
 """The variable of the bundle that has a number for each drive: how much higher than its car's usual the camera is."""
 
 
@@ -200,53 +190,11 @@ class Fleet:
         """Where all unknowns start, by variable: the cars', and a number for each drive, its load."""
         if not self.config.load_m:
             return self.expected
-        return {**self.expected, _LOAD: self.velocity.new_zeros(len(self.of_journey), 1)}
+        return {**self.expected, LOAD: self.velocity.new_zeros(len(self.of_journey), 1)}
 
     def blocks(self, journey: Int[Tensor, " n"]) -> dict[str, Int[Tensor, " n"]]:
         """By variable of `start` the block that drives have."""
-        return {name: journey if name == _LOAD else self.of_journey[journey] for name in self.start}
-
-    def priors(self, scale: Float[Tensor, " kinds"]) -> dict[str, CostTerm]:
-        """Calibrations are about as stated, or as found before, and about as those of the other cars; loads are about 0.
-
-        By `scale` (`calibration_scales`) the sigmas of each of `kinds` are multiplied, of what cars have partly in common
-        those of what they differ in; what was found before keeps its own.
-        """
-        every = torch.arange(len(self.vehicles), device=self.velocity.device)
-        count = len(self.vehicles)
-        first, second = torch.triu_indices(count, count, 1, device=every.device)
-        terms, wider = {}, self._scales(scale)
-        for name in self.variables:
-            together = ~self.found_before[name] & alike(name, self.config).to(every.device)
-            in_common = self.config.in_common
-            alone, apart = _of_cars(together.sum(0).to(self.velocity), in_common, wider[name])
-            own = self.prior_sigma[name] * torch.where(self.found_before[name], 1.0, wider[name])
-            sigma = torch.where(together, alone, own)
-            terms[f"{name}_prior"] = CostTerm(
-                gauss_markov_start,
-                ((name, every),),
-                (self.expected[name],),
-                1 / sigma,
-                takes_rows=True,
-            )
-            if len(first):
-                terms[f"{name}_alike"] = CostTerm(
-                    gauss_markov_start,
-                    ((name, first), (name, second)),
-                    weight=apart * (together[first] & together[second]),
-                    takes_rows=True,
-                )
-        if self.config.load_m:
-            drives = torch.arange(len(self.of_journey), device=every.device)
-            load = self.velocity.new_zeros(len(drives), 1)
-            terms[f"{_LOAD}_prior"] = CostTerm(
-                gauss_markov_start,
-                ((_LOAD, drives),),
-                (load,),
-                torch.ones_like(load),
-                takes_rows=True,
-            )
-        return terms
+        return {name: journey if name == LOAD else self.of_journey[journey] for name in self.start}
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
@@ -260,13 +208,6 @@ class Fleet:
     def new(self, kind: Kind) -> Int[Tensor, " n"]:
         """The cars of which nothing of that kind was found before."""
         return torch.nonzero(~self.found_before[kind.variable][:, kind.at.start])[:, 0]
-
-    def _scales(self, scale: Float[Tensor, " kinds"]) -> dict[str, Float[Tensor, " k"]]:
-        """By variable the scales of every number of a car."""
-        wide: dict[str, list[Tensor]] = {}
-        for kind, own in zip(self.kinds, scale, strict=True):
-            wide.setdefault(kind.variable, []).append(own.expand(kind.at.stop - kind.at.start))
-        return {variable: torch.cat(parts) for variable, parts in wide.items()}
 
     def of_poses(self, term: CostTerm, by: Float[Tensor, "p 6 k"]) -> CostTerm:
         """`pose_white`, of the pose that a true mount and clock would give; `by` is `by_mount` of the poses."""
@@ -296,7 +237,7 @@ class Fleet:
             ground = with_linear_part(ground, "optics", car, by.height)
         if self.config.load_m:
             higher = rows.camera_height.new_full((len(rows), 1, 1), -self.config.load_m)
-            ground = with_linear_part(ground, _LOAD, rows.journey, higher)
+            ground = with_linear_part(ground, LOAD, rows.journey, higher)
         return {"lane_reprojection": image, "lane_height": ground}
 
     def by_mount(self, pose: Float[Tensor, "p 4 4"]) -> Float[Tensor, "p 6 k"]:
@@ -419,25 +360,6 @@ def fleet_of(
     return Fleet(
         vehicles, of_journey, cars, velocity, turning, expected, sigma, found_before, config
     )
-
-
-def _of_cars(
-    count: Float[Tensor, " k"], in_common: float, scale: Float[Tensor, " k"]
-) -> tuple[Float[Tensor, " k"], Float[Tensor, " k"]]:
-    """1-sigma of each car's row and weight of each pair's, by number, where so many cars have something in common.
-
-    `scale` is that of what cars differ in.
-    """
-    apart, alone = variances(count, in_common)
-    apart = apart * scale.square()
-    between = (1 / apart - 1 / alone).clamp_min(0) / count.clamp_min(1)
-    return alone.sqrt(), between.sqrt()
-
-
-def variances(count: Float[Tensor, "*k"], in_common: float) -> tuple[float, Float[Tensor, "*k"]]:
-    """Of `count` cars' numbers, each of which has a variance of 1: of what they differ in, and of sum / sqrt(count)."""
-    apart = max(1 - in_common, _LEAST_APART)
-    return apart, apart + count * in_common
 
 
 def _means(value: Float[Tensor, "m 2"], group: Int[Tensor, " m"]) -> Float[Tensor, "m 2"]:

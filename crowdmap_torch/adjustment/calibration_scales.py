@@ -14,19 +14,35 @@ No largest p(s) is run to: the scale is the one at which as many numbers are wel
 in the mean over all s. What all cars show alike has no say, in either direction: it may be an error of poses that nobody
 models. So the numbers are those that cars differ in, one car has no scale, and of what cars have partly in common their
 mean stays as configured. Nor is a scale ever more than one.
+
+Some cars are further off than any others: a mount that was knocked, a rig.yaml of another lens. What a car has to itself is
+therefore not normal but has the tails of Student's t, as if each car's sigma were f times the others'; of n degrees of
+freedom, with the mean and the covariance that are found (expectation maximisation; Lange, Little and Taylor, Robust
+Statistical Modeling Using the t Distribution, 1989),
+
+    f^2 = (n + E[d^2] / v) / (n + 1)        1 at least
+
+so that it is hardly held back by a prior that it has nothing to do with, and as unsure as that leaves it. d is what it has
+beyond the cars' common share, or their median: of one car nothing, for the same reason. Ten drives past KITTI's signs by one
+car, whose reference errs with all of them, were 0.43 m off where its calibration had tails of its own, 0.23 m without.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.adjustment.calibration import Fleet, variances
+from crowdmap_torch.adjustment.calibration import Fleet
+from crowdmap_torch.adjustment.calibration_priors import (
+    LEAST_APART,
+    CalibrationScales,
+    Variances,
+    variances,
+)
 from crowdmap_torch.optim.solvers.normal_equations import BorderInformation
 
 _SCALES = (0.02, 6.0, 100)
@@ -35,81 +51,70 @@ _LEAST_TOLD = 1e-9
 """Information, in units of the prior's, below which a number is not told at all."""
 _SWEEPS, _RESTS = 20, 0.02
 """Alternations between scales and what is found with them, at most; the change of a scale's logarithm that ends them."""
-
-
-@dataclass(frozen=True)
-class Differences:
-    """What cars differ in, in the numbers of one kind."""
-
-    kind: int
-    row: Int[Tensor, "cars k"]
-    """Where the kind's numbers are among all of the cars."""
-    basis: Float[Tensor, "cars q"]
-    """Orthonormal, at right angles to the mean: differences are sums over cars with these weights."""
-    of_prior: Float[Tensor, "cars cars"]
-    """What is scaled of the prior: 1 / variance times the axes that it is the variance along."""
-    variance: float
-    """Of each difference, by the configuration."""
-
-    def of(self, of_all: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
-        """The differences."""
-        return (self.basis.mT @ of_all[self.row]).flatten()
-
-    def covariance(self, of_all: Float[Tensor, "n n"]) -> Float[Tensor, "m m"]:
-        """Theirs, from that of all numbers."""
-        cars, k = self.row.shape
-        at = self.row.flatten()
-        joint = of_all[at[:, None], at].view(cars, k, cars, k)
-        part = torch.einsum("aq,aibj,br->qirj", self.basis, joint, self.basis)
-        return part.reshape(self.basis.shape[1] * k, -1)
+_TAIL = 4.0
+"""Degrees of freedom of Student's t: of numbers that have it one in sixty is beyond four sigmas."""
 
 
 def rescaled(
-    fleet: Fleet,
-    values: Mapping[str, Tensor],
-    border: BorderInformation,
-    scale: Float[Tensor, " kinds"],
-) -> Float[Tensor, " kinds"]:
-    """By kind, what the sigmas of what cars have wrong are to be multiplied by: one at most.
+    fleet: Fleet, values: Mapping[str, Tensor], border: BorderInformation, scales: CalibrationScales
+) -> CalibrationScales:
+    """By kind, what the sigmas of what cars have wrong are to be multiplied by, one at most, and which cars are beyond.
 
-    `values` were found with the `scale` given, by the information `border`, which has the prior in it. What was found
+    `values` were found with the `scales` given, by the information `border`, which has the prior in it. What was found
     before keeps the sigma that it was found with, and has no say.
     """
-    names, each = fleet.variables, _differences(fleet, values)
-    if not each:
-        return scale
-    told, value = border.on(*names), torch.cat([values[name].flatten() for name in names])
-    seen = told @ value
-    told = told - _scaled_information(each, scale, value)
-    found = scale.clone()
+    names = fleet.variables
+    found = variances(fleet, scales)
+    if not bool(found.is_new.any()):
+        return scales
+    x = torch.cat([values[name] for name in names], dim=1)
+    told = _by_car(border.on(*names), values, names)
+    seen = told @ x.flatten()
+    told = told - prior_information(found)
     for _ in range(_SWEEPS):
-        covariance = torch.linalg.inv(told + _scaled_information(each, found, value))
-        value, before = covariance @ seen, found.clone()
-        for one in each:
-            found[one.kind] = scale_of(
-                one.of(value) / math.sqrt(one.variance),
-                one.covariance(covariance) / one.variance,
-                before[one.kind],
-            ).clamp_max(1)
-        if bool(((found / before).log().abs() < _RESTS).all()):
+        covariance = torch.linalg.inv(told + prior_information(found))
+        x = (covariance @ seen).view_as(x)
+        before, joint = scales, covariance.view(*x.shape, *x.shape)
+        far = far_beyond(x, joint.diagonal(dim1=1, dim2=3), found, before.far)
+        scales = CalibrationScales(_of_kinds(fleet, x, joint, far, before.of_kind), far)
+        found = variances(fleet, scales)
+        if max(float((a / b).log().abs().max()) for a, b in _both(scales, before)) < _RESTS:
             break
-    return found
+    return scales
 
 
-def prior_sigmas(fleet: Fleet, scale: Float[Tensor, " kinds"]) -> dict[str, Float[Tensor, "v _"]]:
-    """1-sigma of what is known of every car before anything is seen, by variable, with the scales that the fleet shows."""
-    found = {name: sigma.clone() for name, sigma in fleet.prior_sigma.items()}
-    for kind, own in zip(fleet.kinds, scale, strict=True):
-        new = fleet.new(kind)
-        if not len(new):
-            continue
-        of_car = own.square()
-        if kind.alike:
-            cars = len(new)
-            apart, together = variances(scale.new_tensor(cars), fleet.config.in_common)
-            of_car = (apart * of_car * (cars - 1) + together) / cars
-        found[kind.variable][new, kind.at] *= of_car.sqrt()
-    return found
+def far_beyond(
+    value: Float[Tensor, "v k"],
+    covariance: Float[Tensor, "v v k"],
+    prior: Variances,
+    far: Float[Tensor, "v k"],
+) -> Float[Tensor, "v k"]:
+    """How far beyond the sigmas of all cars each car is, by what was found of it with the `prior`, itself by `far`."""
+    # What all have in common is not the car's own: d = x - m, with m by all cars, ...
+    by_car = torch.where(prior.is_new, 1 / prior.own, 0.0)
+    total = 1 + prior.shared * by_car.sum(0)
+    weight = prior.shared * by_car / total
+    own = torch.eye(len(value)).to(value)[..., None] - weight
+    missed = torch.einsum("cdk,dk->ck", own, value)
+    left = torch.einsum("cdk,dek,cek->ck", own, covariance, own) + prior.shared / total
+    # ... and where they have nothing in common, what most of them show.
+    middle = torch.where(prior.is_new, value, torch.nan).nanquantile(0.5, dim=0)
+    missed = torch.where(prior.shared > 0, missed, value - middle)
+    square = (missed.square() + left) * far.square() / prior.own
+    beyond = ((_TAIL + square) / (_TAIL + 1)).clamp_min(1).sqrt()
+    return torch.where(prior.is_new & (prior.is_new.sum(0) > 1), beyond, 1.0)
+
+
+def prior_information(prior: Variances) -> Float[Tensor, "n n"]:
+    """What is known of all numbers of all cars before anything is seen, car by car."""
+    alone, pair = prior.rows
+    of_number = (
+        torch.diag_embed((alone + pair * pair.sum(0)).mT) - pair.mT[..., None] * pair.mT[:, None]
+    )
+    cars, count = alone.shape
+    joint = alone.new_zeros(cars, count, cars, count)
+    joint.diagonal(dim1=1, dim2=3).copy_(of_number.permute(1, 2, 0))
+    return joint.view(cars * count, -1)
 
 
 def scale_of(
@@ -140,37 +145,49 @@ def scale_of(
     return low * (high / low) ** ((wanted - below) / (above - below))
 
 
-def _differences(fleet: Fleet, values: Mapping[str, Tensor]) -> list[Differences]:
-    """Of every kind that is new of two cars or more."""
-    first, offset = 0, {}
-    for name in fleet.variables:
-        offset[name] = first
-        first += values[name].numel()
-    found = []
+def _of_kinds(
+    fleet: Fleet,
+    value: Float[Tensor, "v k"],
+    covariance: Float[Tensor, "v k v k"],
+    far: Float[Tensor, "v k"],
+    scale: Float[Tensor, " kinds"],
+) -> Float[Tensor, " kinds"]:
+    """The scale of what cars differ in, of every kind that is new of two cars or more."""
+    found, first = scale.clone(), 0
     for number, kind in enumerate(fleet.kinds):
-        new, wide = fleet.new(kind), values[kind.variable].shape[1]
+        new, count = fleet.new(kind), kind.at.stop - kind.at.start
+        at = torch.arange(first, first + count, device=new.device)
+        first += count
         if len(new) < 2:
             continue
-        column = torch.arange(kind.at.start, kind.at.stop, device=new.device)
-        row = offset[kind.variable] + new[:, None] * wide + column
-        like = values[kind.variable]
-        eye = torch.eye(len(new), dtype=like.dtype, device=like.device)
-        # Whatever is at right angles to the mean.
+        # Whatever is at right angles to the mean of the cars, each in its own sigmas.
+        eye = torch.eye(len(new)).to(value)
         basis = torch.linalg.qr(torch.cat((torch.ones_like(eye[:, :1]), eye[:, 1:]), dim=1)).Q
-        basis, variance, of_prior = basis[:, 1:], 1.0, eye
-        if kind.alike:
-            variance, _ = variances(eye.new_tensor(len(new)), fleet.config.in_common)
-            of_prior = basis @ basis.mT / variance
-        found.append(Differences(number, row, basis, of_prior, variance))
+        basis = basis[:, None, 1:] / far[new[:, None], at][..., None]
+        apart = max(1 - fleet.config.in_common, LEAST_APART) if kind.alike else 1.0
+        joint = covariance[new[:, None], at][..., new[:, None], at]
+        differences = torch.einsum("aiq,ai->iq", basis, value[new[:, None], at])
+        of_them = torch.einsum("aiq,aibj,bjr->iqjr", basis, joint, basis)
+        found[number] = scale_of(
+            differences.flatten() / math.sqrt(apart),
+            of_them.reshape(differences.numel(), -1) / apart,
+            scale[number],
+        ).clamp_max(1)
     return found
 
 
-def _scaled_information(
-    each: list[Differences], scale: Float[Tensor, " kinds"], like: Float[Tensor, " n"]
+def _by_car(
+    matrix: Float[Tensor, "n n"], values: Mapping[str, Tensor], names: tuple[str, ...]
 ) -> Float[Tensor, "n n"]:
-    """What the prior says, as far as it goes by the scales."""
-    found = like.new_zeros(len(like), len(like))
-    for one in each:
-        for row in one.row.unbind(1):
-            found[row[:, None], row] += one.of_prior / scale[one.kind].square()
-    return found
+    """A matrix of all numbers, one variable behind the other, as one of all numbers of one car behind those of another."""
+    first, places = 0, []
+    for name in names:
+        count = values[name].numel()
+        places.append(torch.arange(first, first + count).view(values[name].shape))
+        first += count
+    place = torch.cat(places, dim=1).flatten().to(matrix.device)
+    return matrix[place[:, None], place]
+
+
+def _both(a: CalibrationScales, b: CalibrationScales) -> tuple[tuple[Tensor, Tensor], ...]:
+    return (a.of_kind, b.of_kind), (a.far, b.far)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment import calibration
 from crowdmap_torch.adjustment.bundle import Bundle
-from crowdmap_torch.adjustment.calibration_scales import prior_sigmas
+from crowdmap_torch.adjustment.calibration_priors import prior_sigmas
 from crowdmap_torch.optim.solvers.normal_equations import MapCovariance
 
 UNSEEN = 0.7
@@ -60,8 +60,7 @@ def found_calibration(bundle: Bundle, covariance: MapCovariance) -> FleetCalibra
             unit += [getattr(fleet.config, name)] * count
             labels += [f"{name}{axis}" for axis in _AXES[count]]
     scale = value.new_tensor(unit)
-    before = prior_sigmas(fleet, bundle.calibration_scale)
-    prior = torch.cat([before[name] for name in fleet.variables], dim=1)
+    prior = prior_sigmas(fleet, bundle.calibration_scales)
     sigma = joint.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     found = {}
     for car, name in enumerate(fleet.vehicles):

@@ -14,6 +14,7 @@ from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import CalibrationConfig, Fleet, columns, fleet_of
+from crowdmap_torch.adjustment.calibration_priors import CalibrationScales, priors
 from crowdmap_torch.adjustment.found_calibration import FleetCalibration
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import camera, se3
@@ -153,11 +154,13 @@ def fleet_of_cars(
 
 def covariance_before(fleet: Fleet, variable: str) -> Tensor:
     """Of all cars' numbers [v, k, v, k], by the rows that are known of them before anything is seen."""
-    terms = [
-        term
-        for name, term in fleet.priors(torch.ones(len(fleet.kinds), dtype=F64)).items()
-        if name.startswith(variable)
-    ]
+    numbers = sum(start.shape[1] for start in fleet.expected.values())
+    ones = (
+        torch.ones(len(fleet.kinds), dtype=F64),
+        torch.ones(len(fleet.vehicles), numbers).double(),
+    )
+    every = priors(fleet, CalibrationScales(*ones)).items()
+    terms = [term for name, term in every if name.startswith(variable)]
 
     def cost(x: Tensor) -> Tensor:
         return torch.stack([residuals(t, {variable: x}).square().sum() / 2 for t in terms]).sum()
