@@ -7,8 +7,8 @@ as the driver sees it, z the normal that points at the driver; its origin is the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import torch
@@ -19,6 +19,7 @@ from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.geometry.extent import extent
 from crowdmap_torch.notebook import HasFrame, HasLayers, HasPicture
+from crowdmap_torch.processes.records import with_tensors
 
 LANE_TYPES = ("solid", "dashed", "double", "curb")
 """Lane types by code; -1 is unknown."""
@@ -56,20 +57,7 @@ class Rows(HasFrame):
 
 def to_device(value: Any, device: torch.device | str) -> Any:
     """The same on another device, down to the last tensor in records, tuples and mappings."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    if is_dataclass(value) and not isinstance(value, type):
-        held = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-        moved = {name: to_device(x, device) for name, x in held.items()}
-        changed = {name: x for name, x in moved.items() if x is not held[name]}
-        return replace(value, **changed) if changed else value
-    if isinstance(value, Mapping):
-        moved = {key: to_device(x, device) for key, x in value.items()}
-        return moved if any(moved[key] is not x for key, x in value.items()) else value
-    if isinstance(value, tuple):
-        items = tuple(to_device(x, device) for x in value)
-        return items if any(a is not b for a, b in zip(items, value, strict=True)) else value
-    return value
+    return with_tensors(value, lambda tensor: tensor.to(device))
 
 
 def concatenate(tables: Sequence[Table]) -> Table:

@@ -164,6 +164,7 @@ def drive_along(member: Member) -> None:
     bundle, state = own.bundle(member), own.state
     # The bundle has all that is worth keeping.
     del own
+    give_back()
     while True:
         asked, *of = member.told()
         if asked == "step":
@@ -211,6 +212,8 @@ class Convoys(ExitStack):
         self._leader = self._company.leader
         own = convoy(bundle, state, 0, 0)
         self._own, self._state = own.bundle(self._leader, bundle), own.state
+        # Convoys were copied to be handed over.
+        give_back()
 
     def _program(self, number: int) -> Program:
         return drive_along, convoy(self.bundle, self.state, *self._parts[number])
@@ -223,6 +226,7 @@ class Convoys(ExitStack):
         self._state, finished = adjust_step(self._own, self._state, self._own.backend())
         found = self._leader.for_leader(list, ())
         self._company.renew(lambda: self._follow([part for part in found if part]))
+        give_back()
         assert self.state is not None
         return self.state, finished
 

@@ -23,6 +23,7 @@ from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.poses import read_poses
 from crowdmap_torch.io.rigs import read_rig
+from crowdmap_torch.processes.at_rest import rest
 from crowdmap_torch.ranges import shown
 from crowdmap_torch.tables import Dataset, Journey, Origin, RejectedJourney, Rig
 
@@ -74,7 +75,7 @@ def _load_dataset(folder: Path, strict: bool, wanted: Sequence[str] | None) -> D
                 raise InputError(f"journey {name!r}: {one_line(error)}", error.code) from error
             rejected.append(RejectedJourney(name, one_line(error), error.code))
             continue
-        journeys.append(journey)
+        journeys.append(rest(journey))
         names.append(type_names)
     if not journeys:
         raise NoJourneyLeft(

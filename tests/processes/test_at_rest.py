@@ -1,0 +1,91 @@
+"""Records whose tensors rest in a file: the same numbers, and no more in memory than is read of them."""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from crowdmap_torch.processes import at_rest
+from crowdmap_torch.processes.at_rest import rest
+
+
+@dataclass(frozen=True)
+class Held:
+    name: str
+    column: Tensor
+    parts: tuple[Tensor, ...]
+    more: dict[str, Any]
+
+
+def held(rows: int = 30_000) -> Held:
+    generator = torch.Generator().manual_seed(0)
+    column = torch.randn(rows, 3, generator=generator, dtype=torch.float64)
+    flags = column[:, 0] > 0
+    return Held("x", column, (column.mT, flags, flags[:3]), {"n": torch.arange(rows), "none": None})
+
+
+def tensors(of: Held) -> list[Tensor]:
+    return [of.column, *of.parts, of.more["n"]]
+
+
+def test_a_record_at_rest_is_the_same() -> None:
+    made = held()
+    resting = rest(made)
+    for one, other in zip(tensors(made), tensors(resting), strict=True):
+        assert one.dtype == other.dtype and one.shape == other.shape
+        assert torch.equal(one, other)
+    assert resting.name == "x" and resting.more["none"] is None
+    # Small ones are not worth a file.
+    assert resting.parts[2] is made.parts[2]
+    assert resting.column.data_ptr() != made.column.data_ptr()
+    assert resting.column.data_ptr() % 64 == 0
+
+
+def test_nothing_large_stays_as_it_is() -> None:
+    small = held(10)
+    assert rest(small) is small
+    assert rest(None) is None
+
+
+def test_what_is_written_is_kept_and_goes_no_further() -> None:
+    made = held()
+    resting = rest(made)
+    resting.column[0, 0] = 7.0
+    assert float(resting.column[0, 0]) == 7.0
+    assert float(made.column[0, 0]) != 7.0
+
+
+def test_what_is_sent_is_as_large_as_its_tensors() -> None:
+    resting = rest(held())
+    sent = pickle.dumps(resting.more["n"])
+    assert len(sent) < 1.1 * 30_000 * 8
+    assert torch.equal(pickle.loads(sent), resting.more["n"])
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is read from /proc")
+def test_memory_is_a_files() -> None:
+    def anonymous() -> int:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
+
+    before = anonymous()
+    resting = rest(Held("x", torch.ones(8_000_000, dtype=torch.float64), (), {}))
+    # 64 MB, of which nothing is left in memory that is this process's alone.
+    assert anonymous() - before < 16_000
+    assert float(resting.column.sum()) == 8e6
+
+
+def test_where_there_is_no_disk_it_stays_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    made = held()
+    assert at_rest.rest(made) is made
