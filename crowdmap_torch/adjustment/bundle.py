@@ -49,7 +49,7 @@ _SCALE_STAYS = 0.005
 """A scale of the prior that would change by less than this share stays as it is: the cost is to fall from step to step."""
 _SCALE_RESTS = 0.05
 """Scales of the prior of which none would change by more than this share are at rest: they are not known any better."""
-_CALIBRATIONS = (_SCALE_STAYS, 0.2)
+_CALIBRATION_RESTS = 0.2
 """Likewise of calibrations, which rest on few numbers: a fifth of a prior's sigma moves a map by nothing that shows."""
 _TOLD_HOLDS = 0.02
 """What observations tell of poses' errors is found anew where any scale has changed by more than this share since."""
@@ -142,8 +142,10 @@ class Bundle(BundleState):
         if of_border is not None:
             scaled = self.fleet, values, of_border, self.calibration_scales
             of_cars = self.together.of_all(lambda: rescaled_calibrations(*scaled))
-            at_rest &= self._follow("calibration_scale", of_cars.of_kind, *_CALIBRATIONS)
-            at_rest &= self._follow("calibration_far", of_cars.far, *_CALIBRATIONS)
+            moved = of_cars.ratio_to(self.calibration_scales).log().abs()
+            at_rest &= not bool((moved > _CALIBRATION_RESTS).any())
+            self._move("calibration_scale", of_cars.of_kind)
+            self._move("calibration_far", of_cars.far)
         found = self.together.of_all(
             lambda drift: self.whole.prior.rescaled(drift, self.prior_scale, self.drift_told),
             values["drift"],
@@ -181,10 +183,14 @@ class Bundle(BundleState):
 
     def _follow(self, name: str, found: Tensor, stays: float, rests: float) -> bool:
         """Puts scales where they are `found`, to the last digit that counts; returns whether they are at rest."""
+        return not bool((self._move(name, found, stays) > rests).any())
+
+    def _move(self, name: str, found: Tensor, stays: float = _SCALE_STAYS) -> Tensor:
+        """Likewise; the logarithms of what they change by."""
         scale = getattr(self, name)
         moved = (found / scale).log().abs()
         scale.copy_(torch.where(moved > stays, found, scale))
-        return not bool((moved > rests).any())
+        return moved
 
     @torch.no_grad()
     def judge(self, backend: MapBackend) -> bool:

@@ -39,6 +39,10 @@ class CalibrationScales:
     far: Float[Tensor, "v k"]
     """By car and number, all variables beside each other: how far beyond that it is."""
 
+    def ratio_to(self, other: CalibrationScales) -> Float[Tensor, " n"]:
+        """All of them in multiples of others."""
+        return torch.cat((self.of_kind / other.of_kind, (self.far / other.far).flatten()))
+
 
 @dataclass(frozen=True)
 class Variances:

@@ -65,8 +65,6 @@ def rescaled(
     """
     names = fleet.variables
     found = variances(fleet, scales)
-    if not bool(found.is_new.any()):
-        return scales
     x = torch.cat([values[name] for name in names], dim=1)
     told = _by_car(border.on(*names), values, names)
     seen = told @ x.flatten()
@@ -78,7 +76,7 @@ def rescaled(
         far = far_beyond(x, joint.diagonal(dim1=1, dim2=3), found, before.far)
         scales = CalibrationScales(_of_kinds(fleet, x, joint, far, before.of_kind), far)
         found = variances(fleet, scales)
-        if max(float((a / b).log().abs().max()) for a, b in _both(scales, before)) < _RESTS:
+        if bool((scales.ratio_to(before).log().abs() < _RESTS).all()):
             break
     return scales
 
@@ -187,7 +185,3 @@ def _by_car(
         first += count
     place = torch.cat(places, dim=1).flatten().to(matrix.device)
     return matrix[place[:, None], place]
-
-
-def _both(a: CalibrationScales, b: CalibrationScales) -> tuple[tuple[Tensor, Tensor], ...]:
-    return (a.of_kind, b.of_kind), (a.far, b.far)
