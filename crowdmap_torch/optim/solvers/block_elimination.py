@@ -82,7 +82,7 @@ def leads_of(
 def solve_rounds(
     rounds: Sequence[Round], leads: Sequence[Lead], rest: Float[Tensor, "p k c"]
 ) -> Float[Tensor, "p k c"]:
-    """A^-1 of right-hand sides by place, forth and back through rounds, the last ones of all; `rest` is changed.
+    """A^-1 of right-hand sides by place, forth and back through rounds, the last ones of all, in the memory of `rest`.
 
     The places are counted from the first of these rounds on.
     """
@@ -93,12 +93,13 @@ def solve_rounds(
         rest[own] = whitened
         fill = _turned(lead.towards, whitened).view(-1, *rest.shape[1:])
         rest.index_add_(0, of_round.neighbour.flatten() - gone, fill)
-    solution = torch.zeros_like(rest)
+    # Back in the same memory: neighbours went later, and the last place is nobody's.
+    rest[-1] = 0
     for of_round, lead in zip(reversed(rounds), reversed(leads), strict=True):
         own = slice(of_round.place.start - gone, of_round.place.stop - gone)
-        beside = solution[of_round.neighbour - gone].flatten(1, 2)
-        solution[own] = _turned(lead.whiten, rest[own] + lead.towards @ beside)
-    return solution
+        beside = rest[of_round.neighbour - gone].flatten(1, 2)
+        rest[own] = _turned(lead.whiten, rest[own] + lead.towards @ beside)
+    return rest
 
 
 def _turned(matrix: Float[Tensor, "e k l"], x: Float[Tensor, "e k c"]) -> Float[Tensor, "e l c"]:

@@ -57,35 +57,29 @@ class ChainBorder:
     def add(self, system: TileMatrix, gradient: Float[Tensor, "e k"]) -> None:
         """Adds what chains say of the border to the reduced system and its right-hand side; `gradient` is a.
 
-        Part by part and variable by variable: A^-1 F of all of them is larger than what is solved.
+        Part by part: A^-1 F of all of them is larger than what is solved.
         """
-        structure, plan, pattern = self.structure, self.structure.plan, system.pattern
-        first, every = 0, []
-        for name in plan.border:
-            columns = slice(first, first + structure.where.tangent_dim[name])
-            first = columns.stop
-            every += [(*of, name, columns) for of in zip(structure.parts, self.leads, strict=True)]
-
-        def of_variable(of: tuple[Part, Sequence[Lead], str, slice]) -> tuple[Through, Tensor]:
-            part, leads, name, columns = of
-            right_side = self.link[part.block][..., columns]
-            block = plan.border[name][structure.owner[part.block]]
-            seen, column = torch.unique(block, return_inverse=True)
-            with_gradient = gradient[part.block][..., None]
-            return self.through(part, leads, right_side, with_gradient, column, len(seen)), seen
-
+        structure, pattern = self.structure, system.pattern
+        if not structure.border.shape[1]:
+            return
         forgotten = pattern.at(*torch.full((2, 1), pattern.dim + 1, device=gradient.device))
-        done = in_order(of_variable, every, gradient.device, worth=1)
-        for (*_, name, columns), (found, seen) in zip(every, done, strict=True):
-            at = pattern.at(found.row[:, None, None], structure.where.entries(name, seen))
-            # Not all that a part is coupled to has to do with all that it has of the border.
+
+        def of_part(of: tuple[Part, Sequence[Lead]]) -> Through:
+            part, leads = of
+            chain, column = torch.unique(structure.owner[part.block], return_inverse=True)
+            beside = gradient[part.block][..., None]
+            return self.through(part, leads, self.link[part.block], beside, column, len(chain))
+
+        every = list(zip(structure.parts, self.leads, strict=True))
+        for found in in_order(of_part, every, gradient.device, worth=1):
+            entry = structure.border[found.chain]
+            at = pattern.at(found.row[:, None, None], entry)
+            # Not all that a part is coupled to has to do with all of its chains.
             at = torch.where(at < 0, forgotten, at)
             system.flat.index_add_(0, at.flatten(), found.by_landmark.flatten(), alpha=-1)
-            entry = structure.border[found.chain]
-            at = pattern.at(entry[:, :, None], entry[:, None, columns])
+            at = pattern.at(entry[:, :, None], entry[:, None])
             system.flat.index_add_(0, at.flatten(), found.by_chain.flatten(), alpha=-1)
-            at = entry[:, columns].flatten()
-            system.right_side.index_add_(0, at, found.own.flatten(), alpha=-1)
+            system.right_side.index_add_(0, entry.flatten(), found.own.flatten(), alpha=-1)
 
     def through(
         self,
