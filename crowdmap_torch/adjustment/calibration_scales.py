@@ -49,7 +49,7 @@ _SCALES = (0.02, 6.0, 100)
 """Least, largest and number of the scales that are compared; 6 has 1e-8 of the half-normal's density."""
 _LEAST_TOLD = 1e-9
 """Information, in units of the prior's, below which a number is not told at all."""
-_SWEEPS, _RESTS = 20, 0.02
+_SWEEPS, _RESTS = 10, 0.02
 """Alternations between scales and what is found with them, at most; the change of a scale's logarithm that ends them."""
 _TAIL = 4.0
 """Degrees of freedom of Student's t: of numbers that have it one in sixty is beyond four sigmas."""
