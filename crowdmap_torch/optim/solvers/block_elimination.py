@@ -9,7 +9,7 @@ the store. The products of B_j W_j^T and W_j a_j are what leaves the reduced sys
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -88,18 +88,29 @@ def solve_rounds(
     """
     gone = rounds[0].place.start if rounds else 0
     for of_round, lead in zip(rounds, leads, strict=True):
-        own = slice(of_round.place.start - gone, of_round.place.stop - gone)
-        whitened = lead.whiten @ rest[own]
-        rest[own] = whitened
-        fill = _turned(lead.towards, whitened).view(-1, *rest.shape[1:])
-        rest.index_add_(0, of_round.neighbour.flatten() - gone, fill)
+        for some, own in _by_lots(of_round, gone, rest):
+            whitened = lead.whiten[some] @ rest[own]
+            rest[own] = whitened
+            fill = _turned(lead.towards[some], whitened).view(-1, *rest.shape[1:])
+            rest.index_add_(0, of_round.neighbour[some].flatten() - gone, fill)
     # Back in the same memory: neighbours went later, and the last place is nobody's.
     rest[-1] = 0
     for of_round, lead in zip(reversed(rounds), reversed(leads), strict=True):
-        own = slice(of_round.place.start - gone, of_round.place.stop - gone)
-        beside = rest[of_round.neighbour - gone].flatten(1, 2)
-        rest[own] = _turned(lead.whiten, rest[own] + lead.towards @ beside)
+        for some, own in _by_lots(of_round, gone, rest):
+            beside = rest[of_round.neighbour[some] - gone].flatten(1, 2)
+            rest[own] = _turned(lead.whiten[some], rest[own] + lead.towards[some] @ beside)
     return rest
+
+
+def _by_lots(
+    of_round: Round, gone: int, rest: Float[Tensor, "p k c"]
+) -> Iterator[tuple[slice, slice]]:
+    """The blocks of a round and their places in `rest`, as many at once as a processor's cache holds."""
+    first, count = of_round.place.start - gone, of_round.place.stop - of_round.place.start
+    size = max(1, _LOT // max(rest[:1].numel(), 1))
+    for begin in range(0, count, size):
+        end = min(begin + size, count)
+        yield slice(begin, end), slice(first + begin, first + end)
 
 
 def _turned(matrix: Float[Tensor, "e k l"], x: Float[Tensor, "e k c"]) -> Float[Tensor, "e l c"]:
@@ -179,6 +190,8 @@ class Products:
 
 _HELD = 1 << 24
 """Numbers of windows that may wait."""
+_LOT = 1 << 19
+"""Numbers of right-hand sides that are solved for at once."""
 
 
 def rows_of(batch: Batch, store: Float[Tensor, "rows k"]) -> Float[Tensor, "e w k"]:

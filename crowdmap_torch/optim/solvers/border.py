@@ -94,18 +94,20 @@ class ChainBorder:
 
         `column` is that of each block in the landmarks' sums; the products with what stands `beside` are summed up as well.
         """
-        structure = self.structure
-        x = part.solve(leads, right_side)
+        structure, c = self.structure, right_side.shape[-1]
+        x = part.solved(leads, right_side)
         chain, of = torch.unique(structure.owner[part.block], return_inverse=True)
         row, by_landmark = self._couple(part, x, column, columns)
-        by_chain = x.new_zeros(len(chain), self.link.shape[-1], x.shape[-1])
-        by_chain.index_add_(0, of, self.link[part.block].mT @ x)
-        own = x.new_zeros(len(chain), x.shape[-1], beside.shape[-1])
-        own.index_add_(0, of, x.mT @ beside)
+        by_chain = x.new_zeros(len(chain), self.link.shape[-1], c)
+        own = x.new_zeros(len(chain), c, beside.shape[-1])
+        for some in torch.arange(len(of), device=of.device).split(CHUNK_ROWS):
+            of_some = x[part.place[some]]
+            by_chain.index_add_(0, of[some], self.link[part.block[some]].mT @ of_some)
+            own.index_add_(0, of[some], of_some.mT @ beside[some])
         return Through(row, by_landmark, chain, by_chain, own)
 
     def _couple(
-        self, part: Part, x: Float[Tensor, "n k c"], column: Int[Tensor, " n"], columns: int
+        self, part: Part, x: Float[Tensor, "places k c"], column: Int[Tensor, " n"], columns: int
     ) -> tuple[Int[Tensor, " r"], Float[Tensor, "r columns c"]]:
         """The columns of the reduced system that a part is coupled to, and B x there."""
         structure = self.structure
@@ -118,7 +120,7 @@ class ChainBorder:
                 some = slice(begin, begin + CHUNK_ROWS)
                 of = structure.number[factors[some]]
                 entry = torch.searchsorted(row, at[some]) * columns + column[of][:, None]
-                product = block[some] @ x[of, : block.shape[2]]
+                product = block[some] @ x[part.place[of], : block.shape[2]]
                 total.index_add_(0, entry.flatten(), product.flatten(0, 1))
         return row, total.view(-1, columns, x.shape[-1])
 

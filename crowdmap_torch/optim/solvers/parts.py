@@ -85,9 +85,15 @@ class Part:
         self, leads: Sequence[Lead], right_side: Float[Tensor, "n k c"]
     ) -> Float[Tensor, "n k c"]:
         """A^-1 of right-hand sides of the part's blocks."""
+        return self.solved(leads, right_side)[self.place]
+
+    def solved(
+        self, leads: Sequence[Lead], right_side: Float[Tensor, "n k c"]
+    ) -> Float[Tensor, "places k c"]:
+        """The same by place."""
         rest = right_side.new_zeros(len(self.at_place), *right_side.shape[1:])
         rest[self.place] = right_side
-        return solve_rounds(self.rounds, leads, rest)[self.place]
+        return solve_rounds(self.rounds, leads, rest)
 
     def solve_chains(
         self, leads: Sequence[Lead], right_side: Float[Tensor, "m k c"]
