@@ -34,12 +34,19 @@ def annotations_are_checked_in_every_file() -> None:
 
 
 @pytest.fixture(autouse=True)
-def threads_stay_as_they_were() -> Iterator[None]:
-    """Benchmarks choose their threads; where they are more than cores are free, what follows is many times slower."""
-    before = torch.get_num_threads()
+def threads_and_cores_stay_as_they_were() -> Iterator[None]:
+    """Benchmarks choose their threads and cores; with more threads than cores what follows is many times slower."""
+    before, cores = torch.get_num_threads(), _cores()
     yield
     if torch.get_num_threads() != before:
         torch.set_num_threads(before)
+    if _cores() != cores:
+        os.sched_setaffinity(0, cores)
+
+
+def _cores() -> set[int]:
+    """Where this process may run; nothing where nobody can tell."""
+    return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 
 
 ROOT = Path(__file__).parent.parent
