@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import fields, is_dataclass, replace
@@ -25,7 +27,7 @@ from crowdmap_torch.optim import band_cholesky
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.solvers import sparse_tiles, windows
 from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of
-from crowdmap_torch.tables import Dataset, Rows, to_device
+from crowdmap_torch.tables import Dataset, Journey, Lanes, Rows, Signs, to_device
 
 STEPS = 2
 CONFIG = f"adjust:\n  lm:\n    max_iterations: {STEPS}\n"
@@ -39,7 +41,9 @@ def short() -> MapperConfig:
 
 
 @pytest.fixture(scope="module")
-def transfers(first_here: Stages) -> Iterator[Transfers]:
+def transfers(
+    first_here: Stages, frames_here: FrameByFrame, run_here: tuple[Path, str]
+) -> Iterator[Transfers]:
     """The device is there for all tests of this file, but not for what is made before it: every operation costs more."""
     before = torch.are_deterministic_algorithms_enabled()
     with pretend_device() as counted:
@@ -77,12 +81,26 @@ def there(here: Dataset, transfers: Transfers) -> Dataset:
 
 
 Stages = tuple[tuple[mapper.JourneyMap, ...], mapper.FirstMap]
+FrameByFrame = tuple[Tensor, Signs | None, Lanes | None]
+FRAMES = 14
+"""Of a drive that is mapped frame by frame."""
 
 
 @pytest.fixture(scope="module")
 def first_here(here: Dataset) -> Stages:
     maps = mapper.map_journeys(here.journeys, short())
     return maps, mapper.first_map(here.journeys, maps, short())
+
+
+@pytest.fixture(scope="module")
+def frames_here(here: Dataset) -> FrameByFrame:
+    return frame_by_frame(first_frames(here))
+
+
+@pytest.fixture(scope="module")
+def run_here(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A run of the main job on the CPU, and what it said."""
+    return optimized(folder, tmp_path_factory.mktemp("here") / "run", "cpu")
 
 
 @pytest.fixture(scope="module")
@@ -180,41 +198,45 @@ class AtOnce:
         return done
 
 
-def test_a_drive_is_mapped_frame_by_frame(here: Dataset, transfers, monkeypatch):
-    monkeypatch.setattr("crowdmap_torch.single_journey.ThreadPoolExecutor", AtOnce)
-    part = with_frames(here.journeys[0], torch.arange(14))
-    runs = []
-    for journey in (part, to_device(part, DEVICE)):
+def first_frames(dataset: Dataset) -> Journey:
+    return with_frames(dataset.journeys[0], torch.arange(FRAMES))
+
+
+def frame_by_frame(journey: Journey) -> FrameByFrame:
+    """The tracklet of each sign detection as its frame came, and what the drive shows."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("crowdmap_torch.single_journey.ThreadPoolExecutor", AtOnce)
         one = SingleJourneyMapper(journey.rig)
-        labels = [one.step(frame_of(journey, i)).sign_tracklet.cpu() for i in range(14)]
-        runs.append((torch.cat(labels), *one.finish()))
-    (labels, signs, lanes), (labels_there, *made_there) = runs
+        labels = [one.step(frame_of(journey, i)).sign_tracklet.cpu() for i in range(FRAMES)]
+        return torch.cat(labels), *one.finish()
+
+
+def test_a_drive_is_mapped_frame_by_frame(here: Dataset, frames_here: FrameByFrame, transfers):
+    labels, *made = frames_here
+    labels_there, *made_there = frame_by_frame(to_device(first_frames(here), DEVICE))
     assert torch.equal(labels, labels_there)
-    for table, other in zip((signs, lanes), made_there, strict=True):
-        assert isinstance(table, Rows) and list(differences(table, other)) == []
+    for table, other in zip(made, made_there, strict=True):
+        assert isinstance(table, Rows) and isinstance(other, Rows)
+        assert list(differences(table, other)) == []
+
+
+def optimized(folder: Path, out: Path, device: str) -> tuple[Path, str]:
+    """A run of the main job on this device, and what it said."""
+    config, said = folder.parent / "short.yaml", io.StringIO()
+    config.write_text(CONFIG)
+    options = ["--config", str(config), "--device", device, "--workers", "1", "--log-every", "2"]
+    with contextlib.redirect_stdout(said):
+        assert cli.main(["optimize", str(folder), "--out", str(out), *options]) == 0
+    return out, said.getvalue()
 
 
 def test_optimize_makes_the_cpus_map_to_the_last_bit(
-    folder: Path, tmp_path: Path, transfers, capsys
+    folder: Path, tmp_path: Path, run_here: tuple[Path, str], transfers
 ):
-    config = tmp_path / "short.yaml"
-    config.write_text(CONFIG)
     maps = []
-    for device in ("cpu", "cuda:0"):
-        run = tmp_path / device
-        options = [
-            "--config",
-            str(config),
-            "--device",
-            device,
-            "--workers",
-            "1",
-            "--log-every",
-            "2",
-        ]
-        assert cli.main(["optimize", str(folder), "--out", str(run), *options]) == 0
+    for run, said in (run_here, optimized(folder, tmp_path / "run", "cuda:0")):
         assert (run / "report.html").exists()
-        assert "relative corner" in capsys.readouterr().out
+        assert "relative corner" in said
         maps.append(read_map(run / "map"))
     here, there = maps
     assert len(here.signs) and len(here.lanes)
