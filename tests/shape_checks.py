@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from types import FunctionType
 from typing import Any
 
@@ -11,13 +12,28 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 CALLS = 50
-"""Calls of a function that are checked in each file of tests: checks of all of them take as long as the tests."""
+"""Calls of a function, and makings of a dataclass, that are checked in each file of tests: all of them would take as
+long as the tests."""
 
-checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
+_typed = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """Types and shapes of arguments and results; an int will do for a float, as for every type checker."""
+
+_apart = jaxtyping.jaxtyped("context")
+"""Sizes that have a name have it within."""
 
 _files = 0
 """Files of tests that were begun."""
+
+
+def checked(stub: Callable[..., Any]) -> Callable[..., Any]:
+    """What looks at a call's arguments, or at its result: jaxtyping makes a stub of the function for each of them.
+
+    That of the result is given the arguments as well, which were looked at before the call.
+    """
+    result = stub.__annotations__.get("return", Any)
+    if result is not Any:
+        stub.__annotations__ = {"return": result}
+    return _typed(stub)
 
 
 def begin_file() -> None:
@@ -41,7 +57,11 @@ def install(package: str) -> None:
         def decorated(made: Any) -> Any:
             if "<locals>" in made.__qualname__:
                 return made
-            return _at_first(made, outermost) if type(made) is FunctionType else outermost(made)
+            if type(made) is FunctionType:
+                return _at_first(made, outermost)
+            if isinstance(made, type) and is_dataclass(made) and "__init__" in vars(made):
+                made.__init__ = _at_first(made.__init__, outermost)
+            return made
 
         return decorated
 
@@ -63,7 +83,7 @@ def _at_first(
             file, left = _files, CALLS
         if not left:
             # Sizes that have a name have it in one call only.
-            with jaxtyping.jaxtyped("context"):
+            with _apart:
                 return function(*args, **options)
         left -= 1
         with_checks = with_checks or checks(function)
