@@ -121,7 +121,7 @@ SMALLER: Mapping[str, str] = {
     "crowdmap benchmark bundle": "--sizes 2x6x4 --repeats 1 --solvers ours",
     "crowdmap benchmark cluster": "--sizes 100",
     "crowdmap benchmark ladybug": "--repeats 1 --solvers ours",
-    "crowdmap benchmark journey DATASET --endless 4": "--endless 0.002",
+    "crowdmap benchmark journey DATASET --endless 4": "--endless 0.001",
     "python scripts/soak.py mistakes": "--sets street --only w-x-y-z",
     # It would serve until it is ended.
     "tensorboard": "--inspect",
