@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -30,6 +30,10 @@ _LEAST_GAPS = 3
 """As many gaps of a marker tell how far its dashes are apart."""
 _USUAL_GAP = 1.3
 """Gaps between dashes are at most so much longer than the usual one: points stop short of the ends of dashes."""
+_ENDS_AND_BEND = 3
+"""Control points without which a piece cannot follow a road."""
+_THIN_GAP = 3.0
+"""Of points strewn at random one gap in twenty is longer than so many times their mean distance."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,14 @@ class LanePieces:
             self.point[rows],
             self.t[rows],
         )
+
+    def as_stiff_as_points(self, points_of_control: int) -> LanePieces:
+        """The pieces with no more control points than one for so many points, but for two ends and a bend."""
+        number = torch.bincount(self.piece, minlength=len(self))
+        most = (number // points_of_control).clamp_min(_ENDS_AND_BEND)
+        count = torch.minimum(self.control_count, most)
+        ratio = (count - 1).to(self.t) / (self.control_count - 1)
+        return replace(self, control_count=count, t=self.t * ratio[self.piece])
 
 
 @dataclass(frozen=True)
@@ -116,6 +128,21 @@ def dash_gap(
     of = marker[order][1:][is_gap]
     longest = (_USUAL_GAP * group_median(ahead[is_gap], of, count)).clamp_max(most)
     return torch.where(group_count(of, count) >= _LEAST_GAPS, longest, 0.0)[marker]
+
+
+def thin_gap(
+    marker: Int[Tensor, " p"], along: Float[Tensor, " p"], most: float
+) -> Float[Tensor, " p"]:
+    """The longest gap [m] that chance leaves between points of each point's marker, `most` at most.
+
+    It is short where points are many. Of a marker of which few are seen, a gap says nothing of the paint.
+    """
+    if not len(marker):
+        return torch.zeros_like(along)
+    count = int(marker.max()) + 1
+    low, high = group_range(along, marker, count)
+    mean = (high - low) / (group_count(marker, count) - 1).clamp_min(1)
+    return (_THIN_GAP * mean).clamp_max(most)[marker]
 
 
 def _in_order(
@@ -192,6 +219,20 @@ def cut_by_length(
         point=point,
         t=t[point, which].clamp(0, 1) * (control_count[run[point]] - 1),
     )
+
+
+def with_enough_points(
+    pieces: LanePieces, *, most: int, share: float, least: int
+) -> Bool[Tensor, " n"]:
+    """Which pieces have `most` points, or a `share` of what is usual, if that is fewer, but `least` in any case.
+
+    What is usual is the number in the piece of the point in the middle: however many strays a drive has, they are short.
+    """
+    number = torch.bincount(pieces.piece, minlength=len(pieces))
+    if not len(pieces.piece):
+        return number >= least
+    usual = number[pieces.piece].median()
+    return number >= (share * usual).clamp(min(least, most), most)
 
 
 def cut_by_number(

@@ -25,7 +25,9 @@ from crowdmap_torch.lanes.pieces import (
     dash_gap,
     fit_pieces,
     runs_in_plane,
+    thin_gap,
     well_seen,
+    with_enough_points,
 )
 from crowdmap_torch.ranges import (
     FILLED,
@@ -56,9 +58,10 @@ REASONS = (
     "too short",
     "too uncertain",
     "no better than chance",
+    "too few points",
 )
 """What becomes of a tracklet, by code."""
-KEPT, FEW_FRAMES, NO_POINTS, SHORT, UNCERTAIN, CHANCE = range(len(REASONS))
+KEPT, FEW_FRAMES, NO_POINTS, SHORT, UNCERTAIN, CHANCE, FEW_POINTS = range(len(REASONS))
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,12 @@ class LaneConfig(Settings):
     min_length_m: Length = 4.0
     """Pieces that are shorter are pruned."""
     min_points: Count = 12
-    """Pieces with fewer points are pruned."""
+    """Pieces with fewer points are pruned, ..."""
+    usual_points: Share = 0.25
+    """... or with less than this share of a drive's usual number, where that is fewer: of a marker that is detected in few
+    points, many drives tell where it is."""
+    least_points: Count = 4
+    """However few are usual, so many points make a piece."""
     max_sigma_m: Sigma = 1.0
     """Pieces whose control points are less sure, in the mean, are pruned."""
     band_m: Length = 1.2
@@ -116,11 +124,15 @@ class LaneConfig(Settings):
     """Share of a piece that the next one covers too."""
     control_points: Annotated[int, Range(2, 1000, "a spline has two ends")] = 6
     """Of a whole piece; shorter ones have fewer, at the same spacing."""
+    points_of_control: Count = 2
+    """Pieces have a control point for so many points, three at least: with more, a few points of another marker bend
+    them."""
     max_gap_m: Length = 12.0
     """A marker without points over a longer way ends, and begins again behind it: dashes are bridged,
     intersections are not."""
     max_dash_gap_m: Length = 20.0
-    """Dashes further apart are bridged up to this length, where a marker's gaps are usually as long."""
+    """Dashes further apart are bridged up to this length, where a marker's gaps are usually as long; and so are gaps that
+    chance leaves between few points."""
     noise_px: Pixels = 1.0
     """1-sigma of lane points."""
     normal_sigma: Sigma = 1.5e-3
@@ -183,6 +195,7 @@ def reconstruct_lanes(
     rows = (used & in_range).nonzero()[:, 0]
     ground, detection = ground[rows], detection[rows]
     frame, marker = journey.lanes.frame[detection], label[detection]
+    reason = reason.index_fill(0, marker, FEW_POINTS)
     if is_paper:
         pieces, fit = _papers_pieces(ground, frame, marker, config.paper)
     else:
@@ -235,7 +248,9 @@ def _pieces(
 ) -> tuple[LanePieces, LaneFit]:
     """Splines through pieces of equal length, points weighed by their noise, outliers left out."""
     along = _along(ground, marker)
-    max_gap = dash_gap(marker, along, config.max_dash_gap_m).clamp_min(config.max_gap_m)
+    by_rhythm = dash_gap(marker, along, config.max_dash_gap_m)
+    by_chance = thin_gap(marker, along, config.max_dash_gap_m)
+    max_gap = torch.maximum(by_rhythm, by_chance).clamp_min(config.max_gap_m)
     pieces = cut_by_length(
         marker,
         runs_in_plane(marker, along, ground.point_world[:, :2], max_gap),
@@ -252,7 +267,10 @@ def _pieces(
         normal_sigma=config.normal_sigma,
         drift=config.drift,
     )
-    pieces = pieces.select(torch.bincount(pieces.piece, minlength=len(pieces)) >= config.min_points)
+    enough = with_enough_points(
+        pieces, most=config.min_points, share=config.usual_points, least=config.least_points
+    )
+    pieces = pieces.select(enough).as_stiff_as_points(config.points_of_control)
     fit = fit_pieces(
         pieces, ground.point_world, sigma, smoothing=config.smoothing, scales=config.scales
     )

@@ -69,6 +69,10 @@ _WHY: dict[str, tuple[str, str]] = {
         "lane points do not lie on the road before the car",
         "check the rig's road normal and height",
     ),
+    _TRACK + "too few points": (
+        "of each lane marker few points are detected over a long way",
+        "detect more points of a marker, or markers in more frames",
+    ),
     OUTLIER_JOURNEY: ("journeys contradict each other", "see suspect_journeys in metrics.json"),
     OUTAGE: ("positioning failed for stretches of journeys", "see outages in metrics.json"),
     TOO_FEW_JOURNEYS: ("journeys do not see the same things", "add journeys over the same roads"),

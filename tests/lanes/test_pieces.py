@@ -7,13 +7,16 @@ import torch
 
 from crowdmap_torch.geometry import spline_fit
 from crowdmap_torch.lanes.pieces import (
+    LanePieces,
     cut_by_length,
     cut_by_number,
     dash_gap,
     fit_pieces,
     runs_in_plane,
     runs_of,
+    thin_gap,
     well_seen,
+    with_enough_points,
 )
 
 F64 = torch.float64
@@ -74,6 +77,57 @@ def test_only_gaps_that_come_again_are_between_dashes() -> None:
     # However alike, gaps of forty metres are none between dashes.
     assert longest[len(twice) :].tolist() == [20.0] * 5
     assert len(dash_gap(marker[:0], along[:0], 20.0)) == 0
+
+
+def test_gaps_between_few_points_are_bridged_and_those_between_many_are_not(
+    generator: torch.Generator,
+) -> None:
+    thin = 200.0 * torch.rand(25, generator=generator, dtype=F64)
+    dense = torch.cat((torch.arange(0, 90, 0.5), torch.arange(110, 200, 0.5))).double()
+    along = torch.cat((thin, dense))
+    marker = torch.cat((torch.zeros(len(thin)), torch.ones(len(dense)))).long()
+    longest = thin_gap(marker, along, 20.0)
+    assert bool((longest[: len(thin)] == 20.0).all())
+    assert bool((longest[len(thin) :] < 3.0).all())
+    assert len(thin_gap(marker[:0], along[:0], 20.0)) == 0
+
+
+def _evenly(numbers: list[int]) -> LanePieces:
+    """Whole pieces of six control points with so many points each."""
+    number = torch.tensor(numbers)
+    piece = torch.repeat_interleave(torch.arange(len(number)), number)
+    t = torch.cat([torch.linspace(0, 5, n, dtype=F64) for n in numbers])
+    count = torch.full_like(number, 6)
+    return LanePieces(torch.arange(len(number)), count, piece, torch.arange(len(piece)), t)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "enough"),
+    [
+        ([200, 300, 12, 11, 4], [True, True, True, False, False]),
+        ([24, 24, 6, 5], [True, True, True, False]),
+        ([5, 4, 6, 3], [True, True, True, False]),
+        # However many strays: they hold few of the points.
+        ([100, 100, *[3] * 20], [True, True, *[False] * 20]),
+        ([], []),
+    ],
+)
+def test_few_points_make_a_piece_where_few_are_usual(
+    numbers: list[int], enough: list[bool]
+) -> None:
+    pieces = _evenly(numbers) if numbers else _evenly([1]).select(torch.tensor([False]))
+    assert with_enough_points(pieces, most=12, share=0.25, least=4).tolist() == enough
+
+
+def test_pieces_of_few_points_are_stiff_and_reach_as_far() -> None:
+    pieces = _evenly([4, 9, 12, 80])
+    stiff = pieces.as_stiff_as_points(2)
+    assert stiff.control_count.tolist() == [3, 4, 6, 6]
+    last = stiff.piece.diff(append=stiff.piece.new_tensor([4])) > 0
+    assert stiff.t[last].tolist() == [2.0, 3.0, 5.0, 5.0]
+    line = torch.stack((torch.arange(len(pieces.point)), 0 * pieces.t, 0 * pieces.t), dim=1)
+    sigma = torch.full_like(pieces.t, 0.1)
+    assert fit_pieces(stiff, line.double(), sigma, **PLAIN).miss.abs().max() < 1e-9
 
 
 def test_what_one_detection_of_many_shows_is_not_well_seen() -> None:

@@ -22,6 +22,7 @@ from crowdmap_torch.geometry import se3, spline_length
 from crowdmap_torch.io.truth import JourneyTruth
 from crowdmap_torch.lanes.reconstruct import (
     FEW_FRAMES,
+    FEW_POINTS,
     KEPT,
     METHODS,
     REASONS,
@@ -30,7 +31,7 @@ from crowdmap_torch.lanes.reconstruct import (
 )
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.road.estimate import RoadConfig, estimate_road
-from crowdmap_torch.tables import Lanes, RoadEstimate, Tracklets
+from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Tracklets
 
 
 @pytest.fixture(scope="module")
@@ -235,6 +236,52 @@ def test_short_tracklets_are_pruned_and_counted(
     assert sum(report.pruned.values()) == tracklets.count + 2
     assert set(lanes.tracklet.tolist()) == set((report.reason == KEPT).nonzero()[:, 0].tolist())
     assert tuple(report.pruned) == REASONS
+
+
+def _thinned(
+    truth: JourneyTruth, generator: torch.Generator, *, every: int, most: int
+) -> tuple[Journey, Tracklets]:
+    """The drive with `most` points of what it detected in each `every`-th frame, and their tracklets."""
+    journey, points = truth.journey, truth.journey.lane_points
+    order = torch.randperm(len(points), generator=generator)
+    order = order[points.detection[order].argsort(stable=True)]
+    size = torch.bincount(points.detection, minlength=len(journey.lanes))
+    rank = torch.arange(len(order)) - (size.cumsum(0) - size)[points.detection[order]]
+    rows = order[(rank < most) & (journey.lanes.frame[points.detection[order]] % every == 0)]
+    label = lane_tracklets(truth)
+    return replace(journey, lane_points=points[rows]), label
+
+
+def test_two_points_a_detection_make_lanes(
+    suburb: SimulatedDrives, road: RoadEstimate, generator: torch.Generator
+) -> None:
+    truth = suburb.truths[0]
+    journey, tracklets = _thinned(truth, generator, every=10, most=2)
+    lanes, report = reconstruct_lanes(journey, tracklets, road, LaneConfig())
+    lateral, _, precision = errors(lanes, truth, suburb)
+    # As good as their points are: a handful over forty metres, with a decimetre of noise each.
+    assert lateral.abs().mean() < 0.15 and precision > 0.9
+    assert report.pruned["kept"] >= 0.5 * tracklets.count
+    assert report.pruned["no points near enough"] == 0
+
+
+def test_too_few_points_are_the_reason_that_is_given(
+    suburb: SimulatedDrives, road: RoadEstimate, generator: torch.Generator
+) -> None:
+    journey, tracklets = _thinned(suburb.truths[0], generator, every=50, most=1)
+    _, report = reconstruct_lanes(journey, tracklets, road, LaneConfig())
+    # Of some tracklets the one point of every frame that is left lies further ahead than points are used.
+    assert report.pruned["kept"] == 0
+    assert int((report.reason == FEW_POINTS).sum()) > 0.5 * tracklets.count
+
+
+def test_many_points_make_the_lanes_that_they_made_without_an_eye_to_few(
+    suburb: SimulatedDrives, road: RoadEstimate, lanes: Lanes
+) -> None:
+    truth = suburb.truths[0]
+    config = LaneConfig(usual_points=1.0, least_points=12)
+    there, _ = reconstruct_lanes(truth.journey, lane_tracklets(truth), road, config)
+    assert torch.equal(there.control.point_world, lanes.control.point_world)
 
 
 @pytest.mark.parametrize("method", METHODS)
