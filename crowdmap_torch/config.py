@@ -20,6 +20,7 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.crowd_lanes.cluster import LaneClusterConfig
 from crowdmap_torch.crowd_lanes.join import LaneJoinConfig
 from crowdmap_torch.crowd_signs.complete_tracks import CompleteTracksConfig
+from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig
 from crowdmap_torch.crowd_signs.register import CrowdConfig
 from crowdmap_torch.io.budget import ReadingBudget
 from crowdmap_torch.io.documents import read_yaml_content
@@ -63,6 +64,8 @@ class MapperConfig(Settings):
     """V-A and V-B: clustering and alignment of signs, repeated."""
     complete_tracks: CompleteTracksConfig = field(default_factory=CompleteTracksConfig)
     """V-A.1: detections that clustering set aside, given back to the signs they show."""
+    duplicate_signs: DuplicateSignConfig = field(default_factory=DuplicateSignConfig)
+    """V-B: signs of the adjusted map that are one."""
     lane_join: LaneJoinConfig = field(default_factory=LaneJoinConfig)
     """V-A: lanes of many journeys."""
     lane_cluster: LaneClusterConfig = field(default_factory=LaneClusterConfig)

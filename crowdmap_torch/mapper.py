@@ -24,11 +24,14 @@ from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_lanes
 from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
 from crowdmap_torch.crowd_signs.align import unbiased_poses
 from crowdmap_torch.crowd_signs.complete_tracks import (
+    AssociatedSigns,
     CompletedTracks,
     associate_detections,
+    associated_once,
     complete_tracks,
     with_evidence,
 )
+from crowdmap_torch.crowd_signs.duplicates import may_be_twice
 from crowdmap_torch.crowd_signs.gather import gather_signs
 from crowdmap_torch.crowd_signs.outages import outside_outages
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
@@ -110,6 +113,10 @@ class FirstMap:
     """Per journey the tangents from the given poses to those without bias."""
     completed: CompletedTracks | None
     """What clustering had set aside and was brought back; None with `paper2017`, which does not."""
+    anew: int = 0
+    """How often it was made anew of an adjusted map."""
+    joined: int = 0
+    """Signs that went into others then."""
 
 
 @dataclass(frozen=True)
@@ -146,21 +153,22 @@ def build_map(
     progress: ProgressCall = silent,
     control: SurveySigns | None = None,
 ) -> MapResult:
-    """The map of all journeys; `progress` is told the stage, how much is done and of how much.
-
-    Signs that are in `control` pin the map.
-    """
+    """The map of all journeys, pinned by signs in `control`; `progress` is told the stage, what is done and of how much."""
     journeys = dataset.journeys
     with engine_of(None, workers=workers) as engine:
         maps = map_journeys(journeys, config, engine=engine, progress=progress)
-    first = first_map(journeys, maps, config)
-    bundle = build_bundle(journeys, maps, first, config, control=control)
-    state = begun = adjust.start(bundle)
-    with engine_of(None, workers=workers) as engine:
-        for iteration, after in adjust.steps(bundle, begun, engine=engine):
-            state = after
-            progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
-        return finish_map(dataset, maps, first, bundle, state, config, engine)
+    first = heads = first_map(journeys, maps, config)
+    while True:
+        bundle = build_bundle(journeys, maps, first, config, control=control)
+        state = begun = adjust.start(bundle)
+        with engine_of(None, workers=workers) as engine:
+            for iteration, after in adjust.steps(bundle, begun, engine=engine):
+                state = after
+                progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
+            again = made_anew(journeys, maps, first, bundle, config, engine)
+            if again is None:
+                return finish_map(dataset, maps, first, bundle, state, config, engine, heads)
+        first = again
 
 
 def map_journeys(
@@ -340,6 +348,42 @@ def build_bundle(
 
 @one_core_each()
 @torch.no_grad()
+def made_anew(
+    journeys: Sequence[Journey],
+    maps: Sequence[JourneyMap],
+    first: FirstMap,
+    bundle: Bundle,
+    config: MapperConfig,
+    engine: Engine | None = None,
+) -> FirstMap | None:
+    """What the adjustment begins again with: where it was, and without what turned out to be one; None: nothing did."""
+    rules = config.duplicate_signs
+    signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
+    if first.completed is None or first.anew >= rules.rounds or not len(may_be_twice(signs, rules)):
+        return None
+    known = map_uncertainty(bundle, first.signs, first.lanes, engine)
+    signs = replace(signs, covariance=known.center - known.shared)
+    found = associated_once(
+        *(journeys, poses := adjust.read_poses(bundle, journeys), [m.sign_tracklets for m in maps]),
+        AssociatedSigns(signs, first.tentative, first.associations, first.completed),
+        *(rules, config.complete_tracks),
+        trusted=first.crowd.journey_weight > 0,
+    )
+    return found and replace(
+        first,
+        signs=found.heads,
+        lanes=lanes,
+        tentative=found.tentative,
+        associations=found.associations,
+        drifts=tuple(map(se3.local, (j.T_world_camera for j in journeys), poses)),
+        completed=found.completed,
+        anew=first.anew + 1,
+        joined=first.joined + len(signs) - len(found.heads),
+    )
+
+
+@one_core_each()
+@torch.no_grad()
 def finish_map(
     dataset: Dataset,
     maps: Sequence[JourneyMap],
@@ -348,10 +392,12 @@ def finish_map(
     state: LmState,
     config: MapperConfig,
     engine: Engine | None = None,
+    heads: FirstMap | None = None,
 ) -> MapResult:
     """The adjusted map with its covariances, the refined poses, and which landmark each detection shows.
 
-    Covariances of many drives are found by the hosts of an engine; None: all in this process.
+    Covariances of many drives are found by the hosts of an engine; None: all in this process. Where `first` was made anew,
+    `heads` is the one before any adjustment.
     """
     journeys = dataset.journeys
     poses = adjust.read_poses(bundle, journeys)
@@ -377,8 +423,8 @@ def finish_map(
         provenance["bbox"] = [*dataset.bbox]
     shared = uncertainty.shared
     hd_map = as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
-    clusters = clusters_map(dataset, replace(first, associations=associations), provenance)
-    known = len(bundle.fixed["control"]) if "control" in bundle.fixed else 0
+    of_heads = associations if heads is None or not first.anew else heads.associations
+    clusters = clusters_map(dataset, replace(heads or first, associations=of_heads), provenance)
     return MapResult(
         hd_map=hd_map,
         map_clusters=clusters,
@@ -390,7 +436,7 @@ def finish_map(
         prior_scale=bundle.prior_scale.clone(),
         white_scale=bundle.white_scale.clone(),
         state=state,
-        control_points=known,
+        control_points=len(bundle.fixed["control"]) if "control" in bundle.fixed else 0,
     )
 
 
@@ -398,6 +444,5 @@ def clusters_map(dataset: Dataset, first: FirstMap, provenance: dict | None = No
     """The map of the cluster heads, before bundle adjustment."""
     shared = first.crowd.bias.shared_covariance
     signs = replace(first.signs, covariance=first.signs.covariance + shared)
-    lanes, associations = first.lanes, first.associations
-    provenance = {} if provenance is None else provenance
-    return as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
+    others = first.lanes, first.tentative, first.associations
+    return as_map(dataset, signs, *others, shared, provenance or {})

@@ -28,6 +28,7 @@ import torch
 
 from crowdmap_torch import __version__, mapper
 from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.commands.whereabouts import Whereabouts
 from crowdmap_torch.config import MapperConfig, dump, load_config
@@ -35,6 +36,7 @@ from crowdmap_torch.evaluation.evaluate import Against, against, control_ids_of
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
 from crowdmap_torch.fleet.choice import ENGINES
+from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.io.area import Area, Cut, cut_dataset, cut_truth, read_area
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
@@ -44,6 +46,7 @@ from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.tiled_maps import DEFAULT_LEVEL, TileLevel
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.noise.calibration import KnownCalibration
+from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.processes.interrupts import keeping
 from crowdmap_torch.processes.memory import keep_in_one_place
@@ -60,7 +63,7 @@ from crowdmap_torch.report.tensorboard import TensorBoardLog
 from crowdmap_torch.report.unsettled import unsettled_findings
 from crowdmap_torch.report.watch import Watch
 from crowdmap_torch.runs.calibration import read_found
-from crowdmap_torch.runs.checkpoint import Checkpoint, Found, inputs_of
+from crowdmap_torch.runs.checkpoint import Checkpoint, Found, Step, inputs_of
 from crowdmap_torch.runs.folder import (
     RunFolder,
     figures_of,
@@ -176,9 +179,8 @@ def run(options: argparse.Namespace) -> int:
 def _map(
     options: argparse.Namespace, folder: RunFolder, config: MapperConfig, where: Whereabouts
 ) -> int:
-    device = where.device
     with input_read():
-        given = _read(options, config, device)
+        given = _read(options, config, device := where.device)
         dataset, survey, truth = given.dataset, given.survey, given.truth
         inputs = inputs_of(dataset, config, survey, truth, given.control, given.cars, device=device)
         kept = Checkpoint(folder.checkpoint, inputs)
@@ -208,25 +210,25 @@ def _map(
         if found.first is None:
             log_crowd(log, dataset, first)
 
-        # ---- everything at once (section V-B) ----
-        progress("bundle adjustment: building")
-        bundle = mapper.build_bundle(journeys, maps, first, config, **given.beside(device))
-        watch = given.watch(log, first, config, every=options.log_every)
-        step = found.step
-        begun = adjust.start(bundle) if step is None else adjust.go_on(bundle, step.standing)
-        if found.start is None:
-            kept.keep_start(watch.start(bundle, mapper.clusters_map(dataset, first)))
-        else:
-            watch.go_on(found.start, found.course)
-        state, by, most = begun, where.of_convoys(bundle), config.adjust.lm.max_iterations
-        for iteration, state in adjust.steps(bundle, begun, first=found.steps, engine=by):
-            watch.step(iteration, state, bundle)
-            kept.keep_step(adjust.standing(bundle, state, iteration + 1), watch.course)
-            progress("bundle adjustment", iteration + 1, most, f"cost {float(state.cost):.1f}")
+        # ---- everything at once (section V-B), and again where signs turned out to be one ----
+        watch = given.watch(log, first, config, found, every=options.log_every)
+        last, step = found.again.first if found.again else first, found.step
+        while True:
+            progress("bundle adjustment: building")
+            bundle = mapper.build_bundle(journeys, maps, last, config, **given.beside(device))
+            begun = adjust.start(bundle) if step is None else adjust.go_on(bundle, step.standing)
+            if found.start is None and not last.anew:
+                kept.keep_start(watch.start(bundle, mapper.clusters_map(dataset, first)))
+            watch.follow(last.signs, last.lanes, bundle if last.anew and step is None else None)
+            state, by = _adjusted(bundle, begun, step, last.anew, kept, watch, where, progress)
+            again = mapper.made_anew(journeys, maps, last, bundle, config, by)
+            if again is None:
+                break
+            last, step = kept.keep_anew(again, watch.course), None
 
         # ---- the map ----
         progress("covariances and map")
-        result = mapper.finish_map(dataset, maps, first, bundle, state, config, by)
+        result = mapper.finish_map(dataset, maps, last, bundle, state, config, by, first)
         watch.finish(bundle, result.hd_map)
     # What follows is written and drawn: on the CPU, wherever it was made.
     dataset, result = to_device((dataset, result), "cpu")
@@ -253,6 +255,26 @@ def _map(
     print(counts_line(dataset, result, config))
     print(f"map: {folder.map}\nreport: {folder.report}")
     return EMPTY_MAP if options.strict and missing else 0
+
+
+def _adjusted(
+    bundle: Bundle,
+    begun: LmState,
+    step: Step | None,
+    anew: int,
+    kept: Checkpoint,
+    watch: Watch,
+    where: Whereabouts,
+    progress: Progress,
+) -> tuple[LmState, Engine | None]:
+    """The state when an adjustment is finished, every step watched and kept, and the engine of its convoys."""
+    state, by, most = begun, where.of_convoys(bundle), bundle.config.lm.max_iterations
+    taken = 0 if step is None else step.standing.steps
+    for iteration, state in adjust.steps(bundle, begun, first=taken, engine=by):
+        watch.step(len(watch.iterations), state, bundle)
+        kept.keep_step(adjust.standing(bundle, state, iteration + 1), watch.course, anew)
+        progress("bundle adjustment", iteration + 1, most, f"cost {float(state.cost):.1f}")
+    return state, by
 
 
 @contextmanager
@@ -283,11 +305,20 @@ class _Given:
     """What `--bbox` left out."""
 
     def watch(
-        self, log: TensorBoardLog, first: mapper.FirstMap, config: MapperConfig, *, every: int
+        self,
+        log: TensorBoardLog,
+        first: mapper.FirstMap,
+        config: MapperConfig,
+        found: Found,
+        *,
+        every: int,
     ) -> Watch:
-        """What watches the adjustment, with errors against what is asked of the finished map."""
+        """What watches the adjustment from where it was found, with errors against what is asked of the finished map."""
         least = config.min_confidence
-        return Watch(log, self.asked, first.signs, first.lanes, every=every, min_confidence=least)
+        watch = Watch(log, self.asked, first.signs, first.lanes, every=every, min_confidence=least)
+        if found.start is not None:
+            watch.go_on(found.start, found.course)
+        return watch
 
     @cached_property
     def asked(self) -> Against | None:

@@ -17,6 +17,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.assignment import match_slots
 from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_count, rows_of_ranges
 from crowdmap_torch.clustering.neighbours import near_pairs
+from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, same_sign
 from crowdmap_torch.crowd_signs.existence import existence
 from crowdmap_torch.crowd_signs.projections import (
     Candidates,
@@ -229,6 +230,49 @@ def duplicate_signs(
     return duplicate
 
 
+def associated_once(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    tracklets: Sequence[Tracklets],
+    before: AssociatedSigns,
+    config: DuplicateSignConfig,
+    completion: CompleteTracksConfig,
+    *,
+    trusted: Bool[Tensor, " j"],
+) -> AssociatedSigns | None:
+    """What is `before` with those signs joined that are one, and with what else shows them by now; None if none are.
+
+    `poses` and the heads are adjusted; the heads' covariances are those of their centres without what all positions share.
+    """
+    joined = join_duplicates(before.heads, journeys, before.associations, config)
+    if joined is None:
+        return None
+    heads, associations = joined
+    completed = complete_tracks(journeys, poses, tracklets, heads, associations, completion)
+    associations = completed.associations
+    heads = with_evidence(heads, journeys, associations, trusted, completion)
+    alone = still_alone(before.tentative, tracklets, associations)
+    return AssociatedSigns(heads, before.tentative[alone], associations, completed)
+
+
+def join_duplicates(
+    signs: Signs,
+    journeys: Sequence[Journey],
+    associations: Sequence[Association],
+    config: DuplicateSignConfig,
+) -> tuple[Signs, tuple[Association, ...]] | None:
+    """The signs without those that are another one, and which of them each detection shows; None if all are their own."""
+    into = same_sign(signs, journeys, associations, config)
+    goes = into != torch.arange(len(into), device=into.device)
+    if not bool(goes.any()):
+        return None
+    count = polygon.corner_count(signs.shape)
+    turn, _ = polygon.best_shift(signs.corners_world[into], signs.corners_world, count)
+    moved = tuple(_shown_by(a, into, turn, count) for a in associations)
+    sure = signs.confidence.scatter_reduce(0, into, signs.confidence, "amax")
+    return replace(signs, confidence=sure)[~goes], without_signs(moved, goes)
+
+
 def without_signs(
     associations: Sequence[Association], dropped: Bool[Tensor, " n"]
 ) -> tuple[Association, ...]:
@@ -236,6 +280,21 @@ def without_signs(
     number = torch.where(dropped, -1, (~dropped).cumsum(0) - 1)
     number = torch.cat((number, number.new_full((1,), -1)))  # label -1 reads the last slot
     return tuple(replace(a, sign=number[a.sign]) for a in associations)
+
+
+def _shown_by(
+    association: Association,
+    into: Int[Tensor, " n"],
+    turn: Int[Tensor, " n"],
+    count: Int[Tensor, " n"],
+) -> Association:
+    """The association with the signs that others went into, its corners turned against those."""
+    rows = torch.nonzero(association.sign >= 0)[:, 0]
+    sign, shift = association.sign.clone(), association.sign_shift.clone()
+    before = sign[rows]
+    sign[rows] = into[before]
+    shift[rows] = (turn[before] + shift[rows]) % count[before]
+    return replace(association, sign=sign, sign_shift=shift)
 
 
 def with_evidence(

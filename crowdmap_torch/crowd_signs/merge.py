@@ -81,13 +81,20 @@ def merge_heads(
     alone = (distance < config.alone_m) & (look < config.alone_cost)
     alone &= expected >= config.alone_journeys
     merge = overlaps | (~told_apart & ((cost < config.merge_cost) | alone))
-    cost = cost.masked_fill(~merge, torch.inf)
-    rows = torch.cat((a, b))
-    best, partner = cheapest(rows, torch.cat((b, a)), torch.cat((cost, cost)), len(heads))
-    own = torch.arange(len(heads), device=label.device)
-    mutual = best.isfinite() & (partner[partner.clamp_min(0)] == own)
-    target = torch.where(mutual, torch.minimum(partner, own), own)
+    target = mutual_partners(pair[merge], cost[merge], len(heads))
     return torch.where(label < 0, label, target[label.clamp_min(0)])
+
+
+def mutual_partners(
+    pair: Int[Tensor, "p 2"], cost: Float[Tensor, " p"], count: int
+) -> Int[Tensor, " n"]:
+    """Of `count` rows the smaller of each two that are one another's cheapest partner, of the others themselves."""
+    a, b = pair.T
+    rows = torch.cat((a, b))
+    best, partner = cheapest(rows, torch.cat((b, a)), torch.cat((cost, cost)), count)
+    own = torch.arange(count, device=pair.device)
+    mutual = best.isfinite() & (partner[partner.clamp_min(0)] == own)
+    return torch.where(mutual, torch.minimum(partner, own), own)
 
 
 def dissolve_weak(

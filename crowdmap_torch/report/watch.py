@@ -65,11 +65,18 @@ class Watch:
         self._log = log
         self._asked = asked
         self._survey = None if asked is None else asked.survey
-        self._certain = signs.confidence >= min_confidence
         self._cost = math.nan
-        self._signs = signs
-        self._lanes = lanes
         self._every = max(every, 1)
+        self._least = min_confidence
+        self.follow(signs, lanes)
+
+    @torch.no_grad()
+    def follow(self, signs: Signs, lanes: Lanes, begins: Bundle | None = None) -> None:
+        """What bundles hold from now on; where the adjustment `begins` with another one, costs are told from there."""
+        self._certain = signs.confidence >= self._least
+        self._signs, self._lanes = signs, lanes
+        if begins is not None:
+            self._cost = _cost(_squares(begins))
 
     @torch.no_grad()
     def start(self, bundle: Bundle, map_before: HdMap) -> Residuals:

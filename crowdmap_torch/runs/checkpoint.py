@@ -6,6 +6,7 @@
       first_map.pt         clusters, biases and the map of the cluster heads (V-A)
       start.pt             the pixel residuals before the adjustment, for the report
       step.pt              where the adjustment stands after its last step, and its course (V-B)
+      anew.pt              what it began again with, and its course up to there, where signs turned out to be one
 
 Nothing in it is taken on trust: a run goes on only with what it was made of, a stage that is damaged is made anew, and as
 every stage gives the same bits from the same input, so does the map.
@@ -50,6 +51,17 @@ class Step:
     standing: Standing
     course: Course
     """Of all steps up to it."""
+    anew: int
+    """How often the map that it began with had been made anew."""
+
+
+@dataclass(frozen=True)
+class Anew:
+    """What the adjustment began again with."""
+
+    first: FirstMap
+    course: Course
+    """Of all steps up to there."""
 
 
 @dataclass(frozen=True)
@@ -61,19 +73,22 @@ class Found:
     first: FirstMap | None = None
     start: Residuals | None = None
     """Before the first step."""
+    again: Anew | None = None
     step: Step | None = None
+    """Of the last beginning."""
     damaged: tuple[str, ...] = ()
     """What is made anew, and why."""
 
     @property
     def steps(self) -> int:
-        """How many steps of the adjustment were taken."""
+        """How many steps were taken since the adjustment last began."""
         return 0 if self.step is None else self.step.standing.steps
 
     @property
     def course(self) -> Course:
         """The steps that were taken, as they were watched."""
-        return Course(()) if self.step is None else self.step.course
+        last = self.step or self.again
+        return Course(()) if last is None else last.course
 
     def lines(self, journeys: int) -> list[str]:
         """What was damaged, a line each, and in the last one what was found."""
@@ -81,7 +96,7 @@ class Found:
         if self.first is not None:
             parts.append("clusters and biases")
         if self.step is not None:
-            parts.append(f"step {self.steps}")
+            parts.append(f"step {len(self.course.iterations)}")
         return [*(f"{what}; it is made anew" for what in self.damaged), ", ".join(parts)]
 
 
@@ -130,7 +145,7 @@ class Checkpoint:
     def drop_stages(self) -> None:
         """Removes the stages of a run that is finished."""
         shutil.rmtree(self.folder / "journeys", ignore_errors=True)
-        for name in ("first_map", "start", "step"):
+        for name in ("first_map", "start", "anew", "step"):
             self._path(name).unlink(missing_ok=True)
         drop_halves(self.folder)
 
@@ -148,10 +163,13 @@ class Checkpoint:
         maps = {n: read(_of_journey(n), JourneyMap) for n in range(journeys)}
         known = {number: made for number, made in maps.items() if made is not None}
         first, start = read("first_map", FirstMap), read("start", Residuals)
-        step = read("step", Step)
+        again, step = read("anew", Anew), read("step", Step)
         if start is None:
             return Found(known, first, damaged=tuple(damaged))
-        return Found(known, first, start, step, tuple(damaged))
+        # A run may have ended between the two: the step is of the beginning before then.
+        if step is not None and step.anew != (0 if again is None else again.first.anew):
+            step = None
+        return Found(known, first, start, again, step, tuple(damaged))
 
     def keep_journey(self, number: int, made: JourneyMap) -> None:
         """Keeps what the `number`-th journey shows by itself."""
@@ -166,9 +184,14 @@ class Checkpoint:
         """Keeps the residuals before the first step."""
         self._keep("start", residuals)
 
-    def keep_step(self, standing: Standing, course: Course) -> None:
-        """Keeps a step in place of the one before."""
-        self._keep("step", Step(standing, course))
+    def keep_step(self, standing: Standing, course: Course, anew: int) -> None:
+        """Keeps a step in place of the one before; how often the map that it began with had been made `anew`."""
+        self._keep("step", Step(standing, course, anew))
+
+    def keep_anew(self, first: FirstMap, course: Course) -> FirstMap:
+        """Keeps what the adjustment begins again with, and hands it back."""
+        self._keep("anew", Anew(first, course))
+        return first
 
     def _keep(self, name: str, value: object) -> None:
         write_stage(self._path(name), value, key=self._key)

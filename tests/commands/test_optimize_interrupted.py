@@ -8,12 +8,14 @@ import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from worlds.runs import ROUGH, Said, journeys_of
 
@@ -170,6 +172,52 @@ def test_a_run_cut_again_and_again_repeats_nothing_and_ends_with_the_same_bits(
     (out / "checkpoint" / "step.pt").touch()
     said = optimize(small, out, "--resume")
     assert said.code == 0 and said.out == f"finished already: {out / 'map'}\n"
+    assert [p.name for p in (out / "checkpoint").rglob("*")] == ["inputs.json"]
+
+
+@pytest.fixture
+def torn(cuts: Cuts, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clusters in which the first drive's detections of one sign are a sign of their own."""
+    first_map = mapper.first_map
+
+    def of_two(*arguments, **options) -> mapper.FirstMap:
+        first = first_map(*arguments, **options)
+        count, most = len(first.signs), first.associations[0].sign.mode().values
+        rows = torch.cat((torch.arange(count), most[None]))
+        own = first.associations[0]
+        own = replace(own, sign=torch.where(own.sign == most, count, own.sign))
+        return replace(first, signs=first.signs[rows], associations=(own, *first.associations[1:]))
+
+    monkeypatch.setattr(mapper, "first_map", of_two)
+
+
+def test_a_run_that_begins_its_adjustment_again_goes_on_there(
+    optimize, cuts: Cuts, torn: None, small: Path, tmp_path: Path, run: Path
+):
+    whole, out = tmp_path / "whole", tmp_path / "run"
+    assert optimize(small, whole).code == 0
+    once = cuts.calls["adjust_step"]
+    steps = json.loads((whole / "metrics.json").read_text())["costs"]
+    assert [step["iteration"] for step in steps] == [*range(1, once + 1)]
+    # What was torn is whole, as if it had been so from the beginning.
+    signs, others = (pq.read_table(r / "map" / "signs.parquet") for r in (whole, run))
+    assert signs["sign_id"].to_pylist() == others["sign_id"].to_pylist()
+    before = pq.read_table(whole / "map_clusters" / "signs.parquet")
+    assert len(before) == len(signs) + 1
+    for number in range(1, once + 1):
+        cuts.calls.clear()
+        cuts.cut = ("adjust_step", 1)
+        try:
+            optimize(small, out, *(() if number == 1 else ("--resume",)))
+        except Interruption:
+            continue
+        break
+    cuts.cut = None
+    if not (out / "map").exists():
+        assert optimize(small, out, "--resume").code == 0
+    assert same_map(out, whole)
+    resumed = json.loads((out / "metrics.json").read_text())
+    assert resumed["costs"] == steps
     assert [p.name for p in (out / "checkpoint").rglob("*")] == ["inputs.json"]
 
 

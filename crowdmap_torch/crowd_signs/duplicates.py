@@ -1,0 +1,120 @@
+"""V-B, unlike the paper: which signs of an adjusted map are one.
+
+Where rotations are off, one sign's triangulations by different drives lie metres apart, too far for one cluster. The
+adjustment, which sees all rays at once, brings them to one place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.groups import distinct_pairs, group_count, pairs_within
+from crowdmap_torch.clustering.neighbours import near_pairs
+from crowdmap_torch.crowd_signs.distance import SimilarityConfig, sign_distance
+from crowdmap_torch.crowd_signs.merge import mutual_partners
+from crowdmap_torch.ranges import Cost, Count, Length, Rounds, Settings, Share, Sigma
+from crowdmap_torch.tables import Association, Journey, Signs
+
+
+@dataclass(frozen=True)
+class DuplicateSignConfig(Settings):
+    """When two signs of an adjusted map are one; costs are squared standard deviations."""
+
+    rounds: Rounds = 2
+    """So many times at most the adjustment begins again with what was joined; 0: never."""
+    merge_cost: Cost = 9.0
+    """Signs of one shape whose codes do not contradict each other are one if they are closer than this, ..."""
+    max_distance_m: Length = 1.5
+    """... no further apart than this, and no drive saw both in one frame."""
+    overlap: Share = 0.35
+    """Closer than this share of the smaller side, they are one plate detected twice, whoever saw both."""
+    least_sigma_m: Sigma = 0.02
+    """1-sigma of places that covariances leave out [m]."""
+    candidates: Count = 8
+    """Signs that a sign is compared with, the nearest."""
+    similarity: SimilarityConfig = field(default_factory=SimilarityConfig)
+    """What differences of appearance cost."""
+
+
+def may_be_twice(signs: Signs, config: DuplicateSignConfig) -> Int[Tensor, "p 2"]:
+    """Pairs of signs that stand so near, and look so much alike, that they may be one."""
+    pair = near_pairs(signs.center_world, radius=config.max_distance_m, count=config.candidates)
+    a, b = signs[pair[:, 0]], signs[pair[:, 1]]
+    known = (a.type >= 0) & (b.type >= 0)
+    return pair[(a.shape == b.shape) & ~(known & (a.type != b.type))]
+
+
+def same_sign(
+    signs: Signs,
+    journeys: Sequence[Journey],
+    associations: Sequence[Association],
+    config: DuplicateSignConfig,
+) -> Int[Tensor, " n"]:
+    """Which of the adjusted signs each of them is: of those that are one the one with the most detections.
+
+    Covariances are those of centres without what all positions share.
+    """
+    label = torch.arange(len(signs), device=signs.shape.device)
+    pair = may_be_twice(signs, config)
+    if not len(pair):
+        return label
+    sigma = signs.size.new_full((3,), config.least_sigma_m)
+    cost = sign_distance(signs, signs, pair, config.similarity, sigma)
+    apart = signs.center_world[pair[:, 0]] - signs.center_world[pair[:, 1]]
+    size = signs.size[pair].amin((1, 2))
+    overlaps = (apart.norm(dim=1) < config.overlap * size) & cost.isfinite()
+    together = seen_together(journeys, associations, len(signs))
+    while True:
+        # Of two groups every pair must agree: what was seen beside one of them is neither.
+        told_apart = _told_apart(label, together, pair, overlaps)
+        one = (label[pair[:, 0]] != label[pair[:, 1]]) & ~told_apart
+        one &= overlaps | (cost < config.merge_cost)
+        group = label[pair[one]]
+        if not len(group):
+            break
+        label = mutual_partners(group, cost[one], len(signs))[label]
+    number = sum((group_count(a.sign, len(signs)) for a in associations), torch.zeros_like(label))
+    # Of equals the first.
+    order = (-number).argsort(stable=True)
+    order = order[label[order].argsort(stable=True)]
+    leads = torch.ones_like(label, dtype=torch.bool)
+    leads[1:] = label[order][1:] != label[order][:-1]
+    lead = order[leads][leads.cumsum(0) - 1]
+    return torch.empty_like(label).index_put((order,), lead)
+
+
+def seen_together(
+    journeys: Sequence[Journey], associations: Sequence[Association], count: int
+) -> Int[Tensor, "p 2"]:
+    """Pairs of `count` signs that some drive detected in one frame, the smaller row first."""
+    found = []
+    for journey, association in zip(journeys, associations, strict=True):
+        shown = association.sign >= 0
+        frame, sign, _ = distinct_pairs(journey.signs.frame[shown], association.sign[shown])
+        beside = pairs_within(frame)
+        found.append(torch.unique(sign[beside].sort(dim=1).values, dim=0))
+    pair = torch.cat(found)
+    key = torch.unique(pair[:, 0] * count + pair[:, 1])
+    return torch.stack((key // max(count, 1), key % max(count, 1)), dim=1)
+
+
+def _told_apart(
+    label: Int[Tensor, " n"],
+    together: Int[Tensor, "q 2"],
+    pair: Int[Tensor, "p 2"],
+    overlaps: Bool[Tensor, " p"],
+) -> Bool[Tensor, " p"]:
+    """Which pairs are of groups of which some drive saw two signs at once, one of each; plates that overlap do not count."""
+    count = len(label)
+
+    def key(rows: Int[Tensor, "m 2"]) -> Int[Tensor, " m"]:
+        low, high = rows.sort(dim=1).values.unbind(1)
+        return low * count + high
+
+    seen = together[~torch.isin(key(together), key(pair[overlaps]))]
+    return torch.isin(key(label[pair]), key(label[seen]))

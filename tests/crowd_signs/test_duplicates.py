@@ -1,0 +1,165 @@
+"""Signs of an adjusted map that are one are joined, and those that are two are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from worlds.sign_drive import (
+    F64,
+    SignDrive,
+    associated,
+    drive_past,
+    map_of,
+    shift_of,
+    signs_at,
+    straight_poses,
+    two_journeys,
+)
+
+from crowdmap_torch.crowd_signs.complete_tracks import join_duplicates
+from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, may_be_twice, seen_together
+from crowdmap_torch.geometry import polygon, se3
+from crowdmap_torch.tables import Association, Journey, Signs
+
+CONFIG = DuplicateSignConfig()
+PLACES = [(4.0, 60.0, 3.0), (4.0, 60.0, 2.3), (-5.0, 75.0, 2.8)]
+"""Two signs on one post, 0.7 m apart, and one across the road."""
+
+
+@pytest.fixture
+def drive() -> SignDrive:
+    return drive_past(straight_poses(80), signs_at(PLACES))
+
+
+def with_copy(signs: Signs, row: int, offset: tuple[float, float, float]) -> Signs:
+    """The signs, all alike in type, with a copy of one beside it, and covariances of 0.2 m."""
+    every = signs[torch.tensor([*range(len(signs)), row])]
+    T = every.T_world_sign.clone()
+    T[-1, :3, 3] += torch.tensor(offset, dtype=F64)
+    covariance = 0.04 * torch.eye(3, dtype=F64).expand(len(every), 3, 3)
+    return replace(every, T_world_sign=T, covariance=covariance, type=torch.zeros_like(every.type))
+
+
+def split(
+    drive: SignDrive, row: int
+) -> tuple[Signs, list[Journey], list[Association], Association]:
+    """A map in which the second of two drives has a copy of a sign; and what is right."""
+    copy = len(drive.T_world_sign)
+    second = torch.where(drive.sign == row, copy, drive.sign)
+    journeys, _, associations = two_journeys(drive, second)
+    signs = with_copy(map_of(drive), row, (0.05, 0.1, -0.03))
+    return signs, journeys, associations, associations[0]
+
+
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_what_two_drives_see_each_for_itself_is_one(drive: SignDrive, row: int) -> None:
+    signs, journeys, associations, right = split(drive, row)
+    found = join_duplicates(signs, journeys, associations, CONFIG)
+    assert found is not None
+    joined, shown = found
+    assert len(joined) == len(PLACES)
+    for association in shown:
+        assert torch.equal(association.sign, right.sign)
+        assert torch.equal(association.sign_shift, right.sign_shift)
+    # It stays where it is, of two that as many detections show the first.
+    assert torch.equal(joined.T_world_sign, signs.T_world_sign[: len(PLACES)])
+
+
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_corners_are_turned_against_the_sign_that_stays(drive: SignDrive, turn: int) -> None:
+    """A square's copy may begin at another corner."""
+    square = drive_past(straight_poses(80), signs_at(PLACES), size=(0.7, 0.7))
+    signs, journeys, associations, right = split(square, 2)
+    angle = torch.tensor([0.0, 0, 0, 0, 0, turn * torch.pi / 2], dtype=F64)
+    T = signs.T_world_sign.clone()
+    T[-1] = T[-1] @ se3.exp(angle)
+    signs = replace(signs, T_world_sign=T)
+    of_copy = associations[1].sign == len(PLACES)
+    # What is right of the copy, by its own corners in the images.
+    own = replace(square, T_world_sign=T, size=signs.size, shape=signs.shape)
+    shift = shift_of(replace(own, sign=associations[1].sign))
+    assert not bool((shift == right.sign_shift)[of_copy].any())
+    associations[1] = replace(associations[1], sign_shift=shift)
+    found = join_duplicates(signs, journeys, associations, CONFIG)
+    assert found is not None
+    assert torch.equal(found[1][1].sign_shift, right.sign_shift)
+
+
+def test_plates_on_one_post_are_two_however_uncertain(drive: SignDrive) -> None:
+    known = torch.ones(len(drive.sign), dtype=torch.bool)
+    signs = with_copy(map_of(drive), 0, (0.0, 0.0, 0.0))[torch.tensor([0, 1, 2])]
+    signs = replace(signs, covariance=100 * signs.covariance)
+    assert len(may_be_twice(signs, CONFIG)) == 1
+    assert join_duplicates(signs, [drive.journey], [associated(drive, known)], CONFIG) is None
+
+
+def test_a_copy_of_one_of_two_plates_goes_into_one_of_them(drive: SignDrive) -> None:
+    """Somewhere between the two, it may be either; both are never one."""
+    signs, journeys, associations, _ = split(drive, 0)
+    T = signs.T_world_sign.clone()
+    T[-1, 2, 3] -= 0.3
+    signs = replace(signs, T_world_sign=T, covariance=4 * signs.covariance)
+    found = join_duplicates(signs, journeys, associations, CONFIG)
+    # The second drive saw the copy beside the lower plate.
+    assert found is not None and len(found[0]) == len(PLACES)
+    assert torch.equal(found[1][1].sign, found[1][0].sign)
+
+
+def test_what_differs_or_is_surely_elsewhere_stays_two(drive: SignDrive) -> None:
+    signs, journeys, associations, _ = split(drive, 2)
+
+    def is_joined(**columns: Tensor) -> bool:
+        return (
+            join_duplicates(replace(signs, **columns), journeys, associations, CONFIG) is not None
+        )
+
+    assert is_joined()
+    last = torch.arange(len(signs)) == len(PLACES)
+    assert not is_joined(type=torch.where(last, 1, signs.type))
+    assert is_joined(type=torch.where(last, -1, signs.type))
+    assert not is_joined(shape=torch.where(last, polygon.OCTAGON, signs.shape))
+    away = signs.T_world_sign.clone()
+    away[-1, 0, 3] += 0.6
+    assert is_joined(T_world_sign=away)
+    assert not is_joined(T_world_sign=away, covariance=0.1 * signs.covariance)
+    behind = signs.T_world_sign @ se3.exp(torch.tensor([0, 0, 0, 0, torch.pi, 0.0], dtype=F64))
+    assert not is_joined(T_world_sign=torch.where(last[:, None, None], behind, signs.T_world_sign))
+
+
+def test_plates_that_overlap_are_one_whoever_saw_both(drive: SignDrive) -> None:
+    signs = with_copy(map_of(drive), 2, (0.05, 0.1, -0.03))
+    known = torch.ones(len(drive.sign), dtype=torch.bool)
+    association = associated(drive, known)
+    rows = torch.nonzero(drive.sign == 2)[:, 0]
+    twice = drive.journey.signs[torch.cat((torch.arange(len(drive.sign)), rows))]
+    journey = replace(drive.journey, signs=twice)
+    sign = torch.cat((association.sign, torch.full_like(rows, len(PLACES))))
+    shift = torch.cat((association.sign_shift, association.sign_shift[rows]))
+    both = replace(association, sign=sign, sign_shift=shift)
+    assert [2, 3] in seen_together([journey], [both], len(signs)).tolist()
+    found = join_duplicates(signs, [journey], [both], CONFIG)
+    assert found is not None and len(found[0]) == len(PLACES)
+
+
+def test_a_sign_of_three_copies_is_one_and_as_sure_as_the_surest(drive: SignDrive) -> None:
+    n = len(PLACES)
+    signs = with_copy(with_copy(map_of(drive), 2, (0.1, 0.0, 0.05)), 2, (-0.1, 0.1, 0.0))
+    signs = replace(signs, confidence=torch.tensor([0.9, 0.9, 0.6, 0.7, 0.95], dtype=F64))
+    known = torch.ones(len(drive.sign), dtype=torch.bool)
+    first = associated(drive, known)
+    others = [
+        replace(first, sign=torch.where(first.sign == 2, copy, first.sign)) for copy in (n, n + 1)
+    ]
+    found = join_duplicates(signs, [drive.journey] * 3, [first, *others], CONFIG)
+    assert found is not None and len(found[0]) == n
+    assert found[0].confidence.tolist() == [0.9, 0.9, 0.95]
+
+
+def test_a_map_without_signs_has_none_twice() -> None:
+    drive = drive_past(straight_poses(4), signs_at([(4.0, 30.0, 3.0)]))
+    none = map_of(drive)[torch.zeros(0, dtype=torch.int64)]
+    association = associated(drive, torch.zeros(len(drive.sign), dtype=torch.bool))
+    assert join_duplicates(none, [drive.journey], [association], CONFIG) is None
