@@ -57,6 +57,7 @@ from crowdmap_torch.report.html import write_report
 from crowdmap_torch.report.outcomes import sign_outcomes
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.record import record_of
+from crowdmap_torch.report.rotations import rotation_findings
 from crowdmap_torch.report.stages import keep_and_log, log_crowd
 from crowdmap_torch.report.summaries import counts_line
 from crowdmap_torch.report.tensorboard import TensorBoardLog
@@ -242,7 +243,8 @@ def _map(
             compared = _compared(result, config, given, folder)
         progress.finish()
         missing = _told(missing_findings(dataset, result, config), dataset)
-        warnings = (*findings, *_told(unsettled_findings(first), dataset), *missing)
+        strained = *unsettled_findings(first), *rotation_findings(dataset, result)
+        warnings = (*findings, *_told(strained, dataset), *missing)
         spent = progress, where.engine.spent_on()
         metrics = metrics_of(dataset, result, config, watch.iterations, *spent, *compared)
         folder.write_metrics({**metrics, "area": plain(given.cut), "warnings": plain(warnings)})
