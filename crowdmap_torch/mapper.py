@@ -31,7 +31,7 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     complete_tracks,
     with_evidence,
 )
-from crowdmap_torch.crowd_signs.duplicates import may_be_twice
+from crowdmap_torch.crowd_signs.duplicates import may_be_one
 from crowdmap_torch.crowd_signs.gather import gather_signs
 from crowdmap_torch.crowd_signs.outages import outside_outages
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
@@ -359,7 +359,9 @@ def made_anew(
     """What the adjustment begins again with: where it was, and without what turned out to be one; None: nothing did."""
     rules = config.duplicate_signs
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
-    if first.completed is None or first.anew >= rules.rounds or not len(may_be_twice(signs, rules)):
+    if first.completed is None or first.anew >= rules.rounds:
+        return None
+    if not len(may_be_one(signs, journeys, first.associations, rules)):
         return None
     known = map_uncertainty(bundle, first.signs, first.lanes, engine)
     signs = replace(signs, covariance=known.center - known.shared)

@@ -41,12 +41,25 @@ class DuplicateSignConfig(Settings):
     """What differences of appearance cost."""
 
 
-def may_be_twice(signs: Signs, config: DuplicateSignConfig) -> Int[Tensor, "p 2"]:
-    """Pairs of signs that stand so near, and look so much alike, that they may be one."""
-    pair = near_pairs(signs.center_world, radius=config.max_distance_m, count=config.candidates)
-    a, b = signs[pair[:, 0]], signs[pair[:, 1]]
-    known = (a.type >= 0) & (b.type >= 0)
-    return pair[(a.shape == b.shape) & ~(known & (a.type != b.type))]
+def may_be_one(
+    signs: Signs,
+    journeys: Sequence[Journey],
+    associations: Sequence[Association],
+    config: DuplicateSignConfig,
+) -> Int[Tensor, "p 2"]:
+    """Pairs of signs that stand so near and look so much alike that they may be one, for all that frames show.
+
+    Whether they are, their covariances say, which take long: two plates of one post need none.
+    """
+    pair = _alike(signs, config)
+    if not len(pair):
+        return pair
+    label = torch.arange(len(signs), device=pair.device)
+    together, overlaps = (
+        seen_together(journeys, associations, len(signs)),
+        _overlap(signs, pair, config),
+    )
+    return pair[overlaps | ~_told_apart(label, together, pair, overlaps)]
 
 
 def same_sign(
@@ -60,14 +73,12 @@ def same_sign(
     Covariances are those of centres without what all positions share.
     """
     label = torch.arange(len(signs), device=signs.shape.device)
-    pair = may_be_twice(signs, config)
+    pair = _alike(signs, config)
     if not len(pair):
         return label
     sigma = signs.size.new_full((3,), config.least_sigma_m)
     cost = sign_distance(signs, signs, pair, config.similarity, sigma)
-    apart = signs.center_world[pair[:, 0]] - signs.center_world[pair[:, 1]]
-    size = signs.size[pair].amin((1, 2))
-    overlaps = (apart.norm(dim=1) < config.overlap * size) & cost.isfinite()
+    overlaps = _overlap(signs, pair, config) & cost.isfinite()
     together = seen_together(journeys, associations, len(signs))
     while True:
         # Of two groups every pair must agree: what was seen beside one of them is neither.
@@ -86,6 +97,22 @@ def same_sign(
     leads[1:] = label[order][1:] != label[order][:-1]
     lead = order[leads][leads.cumsum(0) - 1]
     return torch.empty_like(label).index_put((order,), lead)
+
+
+def _alike(signs: Signs, config: DuplicateSignConfig) -> Int[Tensor, "p 2"]:
+    """Pairs near each other, of one shape, whose codes do not contradict each other."""
+    pair = near_pairs(signs.center_world, radius=config.max_distance_m, count=config.candidates)
+    a, b = signs[pair[:, 0]], signs[pair[:, 1]]
+    known = (a.type >= 0) & (b.type >= 0)
+    return pair[(a.shape == b.shape) & ~(known & (a.type != b.type))]
+
+
+def _overlap(
+    signs: Signs, pair: Int[Tensor, "p 2"], config: DuplicateSignConfig
+) -> Bool[Tensor, " p"]:
+    """Which pairs stand where one plate of their size has room."""
+    apart = signs.center_world[pair[:, 0]] - signs.center_world[pair[:, 1]]
+    return apart.norm(dim=1) < config.overlap * signs.size[pair].amin((1, 2))
 
 
 def seen_together(

@@ -20,7 +20,7 @@ from worlds.sign_drive import (
 )
 
 from crowdmap_torch.crowd_signs.complete_tracks import join_duplicates
-from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, may_be_twice, seen_together
+from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, may_be_one, seen_together
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.tables import Association, Journey, Signs
 
@@ -57,6 +57,7 @@ def split(
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_what_two_drives_see_each_for_itself_is_one(drive: SignDrive, row: int) -> None:
     signs, journeys, associations, right = split(drive, row)
+    assert may_be_one(signs, journeys, associations, CONFIG).tolist() == [[row, len(PLACES)]]
     found = join_duplicates(signs, journeys, associations, CONFIG)
     assert found is not None
     joined, shown = found
@@ -92,8 +93,10 @@ def test_plates_on_one_post_are_two_however_uncertain(drive: SignDrive) -> None:
     known = torch.ones(len(drive.sign), dtype=torch.bool)
     signs = with_copy(map_of(drive), 0, (0.0, 0.0, 0.0))[torch.tensor([0, 1, 2])]
     signs = replace(signs, covariance=100 * signs.covariance)
-    assert len(may_be_twice(signs, CONFIG)) == 1
-    assert join_duplicates(signs, [drive.journey], [associated(drive, known)], CONFIG) is None
+    seen = [drive.journey], [associated(drive, known)]
+    # Frames say so: nobody needs to ask for covariances.
+    assert len(may_be_one(signs, *seen, CONFIG)) == 0
+    assert join_duplicates(signs, *seen, CONFIG) is None
 
 
 def test_a_copy_of_one_of_two_plates_goes_into_one_of_them(drive: SignDrive) -> None:
