@@ -15,7 +15,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, group_count, pairs_within
 from crowdmap_torch.clustering.neighbours import near_pairs
-from crowdmap_torch.crowd_signs.distance import SimilarityConfig, sign_distance
+from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance, sign_distance
 from crowdmap_torch.crowd_signs.merge import mutual_partners
 from crowdmap_torch.ranges import Cost, Count, Length, Rounds, Settings, Share, Sigma
 from crowdmap_torch.tables import Association, Journey, Signs
@@ -100,11 +100,12 @@ def same_sign(
 
 
 def _alike(signs: Signs, config: DuplicateSignConfig) -> Int[Tensor, "p 2"]:
-    """Pairs near each other, of one shape, whose codes do not contradict each other."""
+    """Pairs near each other that look so much alike, of one shape, whose codes do not contradict each other."""
     pair = near_pairs(signs.center_world, radius=config.max_distance_m, count=config.candidates)
     a, b = signs[pair[:, 0]], signs[pair[:, 1]]
     known = (a.type >= 0) & (b.type >= 0)
-    return pair[(a.shape == b.shape) & ~(known & (a.type != b.type))]
+    look = appearance_distance(a, b, config.similarity)
+    return pair[(look < config.merge_cost) & (a.shape == b.shape) & ~(known & (a.type != b.type))]
 
 
 def _overlap(

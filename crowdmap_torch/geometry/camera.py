@@ -332,6 +332,8 @@ def _kornia_start(camera: Camera, px: Tensor) -> Tensor:
         ideal = (ideal - centre) / focal
     radius = ideal.square().sum(-1, keepdim=True).sqrt()
     usable = radius < camera.monotonic_radius
+    if bool(usable.all()):
+        return ideal
     return torch.where(usable, ideal, _table_start(camera, px))
 
 
