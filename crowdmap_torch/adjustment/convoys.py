@@ -32,6 +32,7 @@ from crowdmap_torch.optim.solvers.journey_system import JourneyBackend, JourneyE
 from crowdmap_torch.optim.solvers.normal_equations import MapCovariance
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.processes.memory import give_back
+from crowdmap_torch.processes.records import alone
 from crowdmap_torch.processes.together import Member, Together
 
 _OWN = ("pose", "drift")
@@ -216,7 +217,7 @@ class Convoys(ExitStack):
         give_back()
 
     def _program(self, number: int) -> Program:
-        return drive_along, convoy(self.bundle, self.state, *self._parts[number])
+        return drive_along, alone(convoy(self.bundle, self.state, *self._parts[number]))
 
     @torch.no_grad()
     def step(self) -> tuple[LmState, bool]:

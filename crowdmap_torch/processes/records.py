@@ -25,3 +25,13 @@ def with_tensors(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
         items = tuple(with_tensors(x, change) for x in value)
         return items if any(a is not b for a, b in zip(items, value, strict=True)) else value
     return value
+
+
+def alone(value: Any) -> Any:
+    """The same with copies of tensors that are a part of larger memory: sent elsewhere, they would take all of it along."""
+
+    def copied(tensor: Tensor) -> Tensor:
+        own = tensor.numel() * tensor.element_size()
+        return tensor.clone() if tensor.untyped_storage().nbytes() > own else tensor
+
+    return with_tensors(value, copied)

@@ -1,4 +1,4 @@
-"""Records whose tensors rest in a file: the same numbers, and no more in memory than is read of them."""
+"""Records whose tensors rest in a file, or go elsewhere: the same numbers, and no more memory than is theirs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from crowdmap_torch.processes import at_rest
 from crowdmap_torch.processes.at_rest import rest
+from crowdmap_torch.processes.records import alone
 
 
 @dataclass(frozen=True)
@@ -89,3 +90,14 @@ def test_where_there_is_no_disk_it_stays_in_memory(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(tempfile, "TemporaryFile", full)
     made = held()
     assert at_rest.rest(made) is made
+
+
+def test_what_goes_alone_takes_nothing_else_along() -> None:
+    made = held()
+    part = Held("x", made.column[:10], (made.parts[1],), {"n": made.more["n"][5:6]})
+    sent = alone(part)
+    assert len(pickle.dumps(sent.column)) < 1000 < len(pickle.dumps(part.column))
+    for one, other in zip(tensors(part), tensors(sent), strict=True):
+        assert torch.equal(one, other)
+    # What is whole already is not copied.
+    assert sent.parts[0] is part.parts[0]
