@@ -176,6 +176,8 @@ def steps(
     process.
     """
     numbers = range(first, bundle.config.lm.max_iterations)
+    # What was read and matched has left room between what is kept.
+    give_back()
     with ExitStack() as ends:
         shared = len(bundle.convoys) > 1
         convoys = ends.enter_context(Convoys(bundle, state, engine)) if shared else None
