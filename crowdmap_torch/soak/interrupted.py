@@ -291,7 +291,7 @@ def _keep_course(path: Path) -> None:
     for method, name in (
         ("keep_journey", lambda number, made: f"journey {number}"),
         ("keep_first", lambda first: "clusters"),
-        ("keep_step", lambda standing, course: f"step {standing.steps}"),
+        ("keep_step", lambda standing, course, anew: f"step {anew}.{standing.steps}"),
     ):
         setattr(Checkpoint, method, kept(name, getattr(Checkpoint, method)))
 
