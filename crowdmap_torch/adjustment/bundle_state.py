@@ -58,7 +58,7 @@ class BundleState(nn.Module):
     calibration_scale: Tensor
     """By kind of what cars may have wrong, how far they are from the sigmas of `fleet`."""
     calibration_far: Tensor
-    """By car and number, how far beyond that it is."""
+    """By car and number, how far it is beyond these sigmas as they are."""
     drift_told: Tensor
     """By journey and number of a pose, the share of the drift's changes that observations tell."""
     poses_left: Tensor

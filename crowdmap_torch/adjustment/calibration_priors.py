@@ -9,9 +9,9 @@ With m marginalised, that of all cars is one row for each and one for each pair 
 
     sum_c a_c x_c^2 / A + sum_c<d h a_c a_d (x_c - x_d)^2 / A        a_c = 1 / v_c        A = 1 + h sum_c a_c
 
-and of what cars have nothing in common in, mounts and lenses, h = 0. v_c = s^2 f_c^2 times the share that is not in common.
-The scale s is that of all cars, by kind (`calibration_scales`); f_c, one at least, is how far beyond it this one is: a mount
-that was knocked, the focal length of another lens.
+and of what cars have nothing in common in, mounts and lenses, h = 0. v_c = s^2 + f_c^2 - 1 times the share that is not in
+common. The scale s is that of all cars, by kind, one at most (`calibration_scales`); f_c, one at least, is how far this one
+is beyond what the configuration allows for: a mount that was knocked, the focal length of another lens.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from crowdmap_torch.adjustment.calibration import LOAD, Fleet, alike
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.residuals.pose import gauss_markov_start
 
-LEAST_APART = 1e-6
+_LEAST_APART = 1e-6
 """Share of the variance that cars have to themselves where all of it is said to be common."""
 
 
@@ -37,7 +37,7 @@ class CalibrationScales:
     of_kind: Float[Tensor, " kinds"]
     """By kind, for all cars: of what they have partly in common, of what they differ in."""
     far: Float[Tensor, "v k"]
-    """By car and number, all variables beside each other: how far beyond that it is."""
+    """By car and number, all variables beside each other: how far it is beyond the configuration's own."""
 
     def ratio_to(self, other: CalibrationScales) -> Float[Tensor, " n"]:
         """All of them in multiples of others."""
@@ -50,6 +50,8 @@ class Variances:
 
     own: Float[Tensor, "v k"]
     """Of what a car has to itself; of what was found before, of that."""
+    apart: Float[Tensor, " k"]
+    """The same of a new car as configured."""
     shared: Float[Tensor, " k"]
     """Of what all have in common."""
     is_new: Bool[Tensor, "v k"]
@@ -77,12 +79,12 @@ def variances(fleet: Fleet, scales: CalibrationScales) -> Variances:
     before = torch.cat([fleet.prior_sigma[name] for name in names], dim=1).square()
     square = _of_numbers(fleet, scales.of_kind).square()
     in_common = torch.where(is_alike, fleet.config.in_common, 0.0).to(square)
-    apart = (1 - in_common).clamp_min(LEAST_APART)
+    apart = (1 - in_common).clamp_min(_LEAST_APART)
     # The mean of all cars stays as configured, whatever they differ in.
     mean = apart * (1 - square) / is_new.sum(0).clamp_min(1)
     shared = torch.where(is_alike, in_common + mean, 0.0)
-    own = torch.where(is_new, apart * square * scales.far.square(), before)
-    return Variances(own, shared, is_new)
+    own = torch.where(is_new, apart * (square + scales.far.square() - 1), before)
+    return Variances(own, apart, shared, is_new)
 
 
 def priors(fleet: Fleet, scales: CalibrationScales) -> dict[str, CostTerm]:

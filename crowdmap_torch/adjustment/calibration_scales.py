@@ -15,15 +15,16 @@ in the mean over all s. What all cars show alike has no say, in either direction
 models. So the numbers are those that cars differ in, one car has no scale, and of what cars have partly in common their
 mean stays as configured. Nor is a scale ever more than one.
 
-Some cars are further off than any others: a mount that was knocked, a rig.yaml of another lens. What a car has to itself is
-therefore not normal but has the tails of Student's t, as if each car's sigma were f times the others'; of n degrees of
-freedom, with the mean and the covariance that are found (expectation maximisation; Lange, Little and Taylor, Robust
-Statistical Modeling Using the t Distribution, 1989),
+Some cars are further off than a configuration allows for: a mount that was knocked, a rig.yaml of another lens. What a car
+has to itself is therefore not normal but has the tails of Student's t, as if each car's sigma were f times that of the
+configuration; of n degrees of freedom, with the mean and the covariance that are found (expectation maximisation; Lange,
+Little and Taylor, Robust Statistical Modeling Using the t Distribution, 1989),
 
-    f^2 = (n + E[d^2] / v) / (n + 1)        1 at least
+    f^2 = (n + E[d^2]) / (n + 1)        1 at least
 
-so that it is hardly held back by a prior that it has nothing to do with, and as unsure as that leaves it. d is what it has
-beyond the cars' common share, or their median: of one car nothing, for the same reason. Ten drives past KITTI's signs by one
+so that it is hardly held back by a prior that it has nothing to do with, and as unsure as that leaves it. Of cars that
+are within a sigma f is one: a fleet that errs less than configured has scales and no tails. d is what a car has beyond
+the cars' common share, or their median: of one car nothing, for the same reason. Ten drives past KITTI's signs by one
 car, whose reference errs with all of them, were 0.43 m off where its calibration had tails of its own, 0.23 m without.
 """
 
@@ -37,12 +38,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.adjustment.calibration import Fleet
-from crowdmap_torch.adjustment.calibration_priors import (
-    LEAST_APART,
-    CalibrationScales,
-    Variances,
-    variances,
-)
+from crowdmap_torch.adjustment.calibration_priors import CalibrationScales, Variances, variances
 from crowdmap_torch.optim.solvers.normal_equations import BorderInformation
 
 _SCALES = (0.02, 6.0, 100)
@@ -73,8 +69,8 @@ def rescaled(
         covariance = torch.linalg.inv(told + prior_information(found))
         x = (covariance @ seen).view_as(x)
         before, joint = scales, covariance.view(*x.shape, *x.shape)
-        far = far_beyond(x, joint.diagonal(dim1=1, dim2=3), found, before.far)
-        scales = CalibrationScales(_of_kinds(fleet, x, joint, far, before.of_kind), far)
+        far = far_beyond(x, joint.diagonal(dim1=1, dim2=3), found)
+        scales = CalibrationScales(_of_kinds(fleet, x, joint, found, before.of_kind), far)
         found = variances(fleet, scales)
         if bool((scales.ratio_to(before).log().abs() < _RESTS).all()):
             break
@@ -82,12 +78,9 @@ def rescaled(
 
 
 def far_beyond(
-    value: Float[Tensor, "v k"],
-    covariance: Float[Tensor, "v v k"],
-    prior: Variances,
-    far: Float[Tensor, "v k"],
+    value: Float[Tensor, "v k"], covariance: Float[Tensor, "v v k"], prior: Variances
 ) -> Float[Tensor, "v k"]:
-    """How far beyond the sigmas of all cars each car is, by what was found of it with the `prior`, itself by `far`."""
+    """How far each car is beyond the configuration's sigmas, by what was found of it with the `prior`."""
     # What all have in common is not the car's own: d = x - m, with m by all cars, ...
     by_car = torch.where(prior.is_new, 1 / prior.own, 0.0)
     total = 1 + prior.shared * by_car.sum(0)
@@ -98,7 +91,7 @@ def far_beyond(
     # ... and where they have nothing in common, what most of them show.
     middle = torch.where(prior.is_new, value, torch.nan).nanquantile(0.5, dim=0)
     missed = torch.where(prior.shared > 0, missed, value - middle)
-    square = (missed.square() + left) * far.square() / prior.own
+    square = (missed.square() + left) / prior.apart
     beyond = ((_TAIL + square) / (_TAIL + 1)).clamp_min(1).sqrt()
     return torch.where(prior.is_new & (prior.is_new.sum(0) > 1), beyond, 1.0)
 
@@ -147,29 +140,27 @@ def _of_kinds(
     fleet: Fleet,
     value: Float[Tensor, "v k"],
     covariance: Float[Tensor, "v k v k"],
-    far: Float[Tensor, "v k"],
+    prior: Variances,
     scale: Float[Tensor, " kinds"],
 ) -> Float[Tensor, " kinds"]:
-    """The scale of what cars differ in, of every kind that is new of two cars or more."""
+    """The scale of what cars differ in, of every kind that is new of two cars or more, found with `prior` and `scale`."""
     found, first = scale.clone(), 0
+    sigma = prior.own.sqrt()
     for number, kind in enumerate(fleet.kinds):
         new, count = fleet.new(kind), kind.at.stop - kind.at.start
         at = torch.arange(first, first + count, device=new.device)
         first += count
         if len(new) < 2:
             continue
-        # Whatever is at right angles to the mean of the cars, each in its own sigmas.
+        # Whatever is at right angles to the mean of the cars, each in its own sigmas but for the scale.
         eye = torch.eye(len(new)).to(value)
         basis = torch.linalg.qr(torch.cat((torch.ones_like(eye[:, :1]), eye[:, 1:]), dim=1)).Q
-        basis = basis[:, None, 1:] / far[new[:, None], at][..., None]
-        apart = max(1 - fleet.config.in_common, LEAST_APART) if kind.alike else 1.0
+        basis = basis[:, None, 1:] * (scale[number] / sigma[new[:, None], at])[..., None]
         joint = covariance[new[:, None], at][..., new[:, None], at]
         differences = torch.einsum("aiq,ai->iq", basis, value[new[:, None], at])
         of_them = torch.einsum("aiq,aibj,bjr->iqjr", basis, joint, basis)
         found[number] = scale_of(
-            differences.flatten() / math.sqrt(apart),
-            of_them.reshape(differences.numel(), -1) / apart,
-            scale[number],
+            differences.flatten(), of_them.reshape(differences.numel(), -1), scale[number]
         ).clamp_max(1)
     return found
 

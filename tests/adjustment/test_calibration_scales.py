@@ -154,7 +154,7 @@ def test_rows_and_sigmas_of_a_scaled_prior_are_the_same(tiny: Dataset) -> None:
     # What was found before is as sure as it was then.
     assert float(found[1, 3]) == pytest.approx(0.2)
     # The mount of the third car has a sigma of its own.
-    assert float(found[2, 1]) == pytest.approx(5 * float(found[1, 1]))
+    assert float(found[2, 1]) ** 2 == pytest.approx(float(found[1, 1]) ** 2 + 5**2 - 1)
     information = prior_information(variances(fleet, scales))
     torch.testing.assert_close(torch.linalg.inv(information).diagonal().sqrt(), found.flatten())
 
@@ -199,6 +199,15 @@ def test_cars_that_err_as_configured_have_no_tails(tiny: Dataset) -> None:
     assert float(far.max()) < 1.5
     # Of normal numbers the mean is 0.07.
     assert float(far.log().mean()) < 0.1
+
+
+def test_a_fleet_that_errs_less_than_configured_has_no_tails(tiny: Dataset) -> None:
+    fleet = fleet_of_cars(tiny, "abcdefgh")
+    seen = {"mount": 0.2 * normal(24).view(8, 3), "optics": 0.2 * normal(16, 1).view(8, 2)}
+    sigma = {name: torch.full_like(part, 0.1) for name, part in seen.items()}
+    found = rescaled_by(fleet, seen, sigma)
+    assert float(found.of_kind.max()) < 0.5
+    assert bool((found.far == 1).all())
 
 
 def test_one_car_has_no_scale(tiny: Dataset) -> None:
