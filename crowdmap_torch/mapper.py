@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
@@ -33,7 +33,6 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
 )
 from crowdmap_torch.crowd_signs.duplicates import may_be_one
 from crowdmap_torch.crowd_signs.gather import gather_signs
-from crowdmap_torch.crowd_signs.outages import outside_outages
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.engine import Engine
@@ -69,8 +68,8 @@ from crowdmap_torch.tracking.signs import associate_signs
 ProgressCall = Callable[[str, int, int], object]
 
 
-def silent(stage: str, done: int, total: int) -> None:
-    """Progress that nobody listens to."""
+def silent(*told: object) -> None:
+    """Nobody listens."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +88,6 @@ class JourneyMap:
 
 
 KeepCall = Callable[[int, JourneyMap], object]
-
-
-def forget(number: int, made: JourneyMap) -> None:
-    """Keeps nothing."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +112,8 @@ class FirstMap:
     """How often it was made anew of an adjusted map."""
     joined: int = 0
     """Signs that went into others then."""
+    before: FirstMap | None = None
+    """That of the clusters, before any adjustment, where it was made anew."""
 
 
 @dataclass(frozen=True)
@@ -157,18 +154,10 @@ def build_map(
     journeys = dataset.journeys
     with engine_of(None, workers=workers) as engine:
         maps = map_journeys(journeys, config, engine=engine, progress=progress)
-    first = heads = first_map(journeys, maps, config)
-    while True:
-        bundle = build_bundle(journeys, maps, first, config, control=control)
-        state = begun = adjust.start(bundle)
-        with engine_of(None, workers=workers) as engine:
-            for iteration, after in adjust.steps(bundle, begun, engine=engine):
-                state = after
-                progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
-            again = made_anew(journeys, maps, first, bundle, config, engine)
-            if again is None:
-                return finish_map(dataset, maps, first, bundle, state, config, engine, heads)
-        first = again
+    first = first_map(journeys, maps, config)
+    how = {"control": control, "progress": progress}
+    with engine_of(None, workers=workers) as engine:
+        return adjusted_map(dataset, maps, first, config, engine=engine, **how)
 
 
 def map_journeys(
@@ -180,7 +169,7 @@ def map_journeys(
     progress: ProgressCall = silent,
     known: Mapping[int, JourneyMap] | None = None,
     tracklets: Mapping[int, Tracklets] | None = None,
-    keep: KeepCall = forget,
+    keep: KeepCall = silent,
 ) -> tuple[JourneyMap, ...]:
     """Section IV for every journey, by the workers of an engine (None: in this process), each on one core.
 
@@ -216,10 +205,6 @@ def map_stored(
 ) -> JourneyMap:
     """Section IV of a journey that is read where the work is done."""
     return map_journey(drive.read(), number, config, tracklets)
-
-
-def ready() -> None:
-    """A worker that has come here has imported all that mapping a journey takes."""
 
 
 @one_core_each()
@@ -282,7 +267,7 @@ def first_map(
         rounds = clusters.rounds
     else:
         # Bad drives leave nothing behind: where they are off is not known well enough to move their pieces.
-        trusted = trusted_frames(journeys, crowd)
+        trusted = crowd.trusted_frames(journeys)
         moved = [
             unbiased_lanes(pieces.select(torch.nonzero(is_good[pieces.frame])[:, 0]), drift)
             for pieces, drift, is_good in zip(made, drifts, trusted, strict=True)
@@ -299,15 +284,6 @@ def first_map(
         associations=found.associations,
         drifts=drifts,
         completed=found.completed,
-    )
-
-
-def trusted_frames(journeys: Sequence[Journey], crowd: Crowd) -> tuple[Bool[Tensor, " _"], ...]:
-    """By journey the frames that have a say: all but those of bad drives, and of outages of positioning."""
-    outages = crowd.report.outages
-    return tuple(
-        outside_outages(station(journey.T_world_camera), number, outages) & (weight > 0)
-        for number, (journey, weight) in enumerate(zip(journeys, crowd.journey_weight, strict=True))
     )
 
 
@@ -337,13 +313,38 @@ def build_bundle(
         config.adjust,
         lane_tracklets=[m.lane_tracklets for m in maps],
         lane_support=first.lane_support,
-        trusted=trusted_frames(journeys, first.crowd),
+        trusted=first.crowd.trusted_frames(journeys),
         calibration=config.calibration,
         known_cars=known_cars,
         control=None
         if control is None
         else find_control_signs(first.signs, control, config.control),
     )
+
+
+@one_core_each()
+def adjusted_map(
+    dataset: Dataset,
+    maps: Sequence[JourneyMap],
+    first: FirstMap,
+    config: MapperConfig,
+    *,
+    control: SurveySigns | None = None,
+    engine: Engine | None = None,
+    progress: ProgressCall = silent,
+) -> MapResult:
+    """Section V-B: the `first` map adjusted, and once more where signs turned out to be one."""
+    journeys = dataset.journeys
+    while True:
+        bundle = build_bundle(journeys, maps, first, config, control=control)
+        state = begun = adjust.start(bundle)
+        for iteration, after in adjust.steps(bundle, begun, engine=engine):
+            state = after
+            progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
+        again = made_anew(journeys, maps, first, bundle, config, engine)
+        if again is None:
+            return finish_map(dataset, maps, first, bundle, state, config, engine)
+        first = again
 
 
 @one_core_each()
@@ -381,6 +382,7 @@ def made_anew(
         completed=found.completed,
         anew=first.anew + 1,
         joined=first.joined + len(signs) - len(found.heads),
+        before=first.before or first,
     )
 
 
@@ -394,12 +396,10 @@ def finish_map(
     state: LmState,
     config: MapperConfig,
     engine: Engine | None = None,
-    heads: FirstMap | None = None,
 ) -> MapResult:
     """The adjusted map with its covariances, the refined poses, and which landmark each detection shows.
 
-    Covariances of many drives are found by the hosts of an engine; None: all in this process. Where `first` was made anew,
-    `heads` is the one before any adjustment.
+    Covariances of many drives are found by the hosts of an engine; None: all in this process.
     """
     journeys = dataset.journeys
     poses = adjust.read_poses(bundle, journeys)
@@ -425,11 +425,10 @@ def finish_map(
         provenance["bbox"] = [*dataset.bbox]
     shared = uncertainty.shared
     hd_map = as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
-    of_heads = associations if heads is None or not first.anew else heads.associations
-    clusters = clusters_map(dataset, replace(heads or first, associations=of_heads), provenance)
+    heads = first.before or replace(first, associations=associations)
     return MapResult(
         hd_map=hd_map,
-        map_clusters=clusters,
+        map_clusters=clusters_map(dataset, heads, provenance),
         journey_maps=tuple(maps),
         first=first,
         associations=associations,

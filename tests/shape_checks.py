@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import is_dataclass
 from types import FunctionType
 from typing import Any
 
@@ -12,8 +11,7 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 CALLS = 50
-"""Calls of a function, and makings of a dataclass, that are checked in each file of tests: all of them would take as
-long as the tests."""
+"""Calls of a function that are checked in each file of tests: checks of all of them take as long as the tests."""
 
 _typed = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """Types and shapes of arguments and results; an int will do for a float, as for every type checker."""
@@ -57,11 +55,7 @@ def install(package: str) -> None:
         def decorated(made: Any) -> Any:
             if "<locals>" in made.__qualname__:
                 return made
-            if type(made) is FunctionType:
-                return _at_first(made, outermost)
-            if isinstance(made, type) and is_dataclass(made) and "__init__" in vars(made):
-                made.__init__ = _at_first(made.__init__, outermost)
-            return made
+            return _at_first(made, outermost) if type(made) is FunctionType else outermost(made)
 
         return decorated
 

@@ -229,7 +229,7 @@ def _map(
 
         # ---- the map ----
         progress("covariances and map")
-        result = mapper.finish_map(dataset, maps, last, bundle, state, config, by, first)
+        result = mapper.finish_map(dataset, maps, last, bundle, state, config, by)
         watch.finish(bundle, result.hd_map)
     # What follows is written and drawn: on the CPU, wherever it was made.
     dataset, result = to_device((dataset, result), "cpu")

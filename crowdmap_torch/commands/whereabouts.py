@@ -67,7 +67,8 @@ class Whereabouts(ExitStack):
         with suppress(OSError):
             journeys = sum(1 for _ in (folder / "journeys").iterdir())
             for number in range(min(self.engine.free, journeys)):
-                self.engine.submit(number, ("the start of a worker", mapper.ready, ()))
+                # To come to it, a worker imports all that mapping a journey takes.
+                self.engine.submit(number, ("the start of a worker", mapper.silent, ()))
                 self._starting += 1
 
     def _await_workers(self) -> None:

@@ -55,10 +55,8 @@ def may_be_one(
     if not len(pair):
         return pair
     label = torch.arange(len(signs), device=pair.device)
-    together, overlaps = (
-        seen_together(journeys, associations, len(signs)),
-        _overlap(signs, pair, config),
-    )
+    together = seen_together(journeys, associations, len(signs))
+    overlaps = _overlap(signs, pair, config)
     return pair[overlaps | ~_told_apart(label, together, pair, overlaps)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -52,7 +53,13 @@ from crowdmap_torch.crowd_signs.merge import (
     join_passes,
     merge_heads,
 )
-from crowdmap_torch.crowd_signs.outages import Outage, OutageConfig, displaced_by, find_outages
+from crowdmap_torch.crowd_signs.outages import (
+    Outage,
+    OutageConfig,
+    displaced_by,
+    find_outages,
+    outside_outages,
+)
 from crowdmap_torch.crowd_signs.outlier_journeys import (
     JourneyStatistics,
     OutlierJourney,
@@ -63,9 +70,10 @@ from crowdmap_torch.crowd_signs.outlier_journeys import (
 from crowdmap_torch.crowd_signs.rounds import CrowdRound, crowd_round
 from crowdmap_torch.crowd_signs.stretches import vote_by_stretch
 from crowdmap_torch.crowd_signs.vote import VoteConfig
+from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.ranges import FILLED, Count, Rounds, Settings, Share, Sigma, Spacing
-from crowdmap_torch.tables import Signs
+from crowdmap_torch.tables import Journey, Signs
 
 METHODS = ("joint", "paper2017")
 
@@ -155,6 +163,16 @@ class Crowd:
     journey_weight: Float[Tensor, " j"]
     """1; 0 for bad drives, which had no say in the heads and biases of others."""
     report: CrowdReport
+
+    def trusted_frames(self, journeys: Sequence[Journey]) -> tuple[Bool[Tensor, " _"], ...]:
+        """By journey the frames that have a say: all but those of bad drives, and of outages of positioning."""
+        return tuple(
+            outside_outages(station(journey.T_world_camera), number, self.report.outages)
+            & (weight > 0)
+            for number, (journey, weight) in enumerate(
+                zip(journeys, self.journey_weight, strict=True)
+            )
+        )
 
 
 def register_crowd(

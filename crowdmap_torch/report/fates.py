@@ -13,7 +13,7 @@ from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.area import OUTSIDE
 from crowdmap_torch.io.detections import DROPPED_LANE, DROPPED_SIGN
 from crowdmap_torch.lanes import reconstruct
-from crowdmap_torch.mapper import MapResult, trusted_frames
+from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.signs import triangulate
 from crowdmap_torch.tables import Dataset
@@ -104,7 +104,7 @@ def sign_fates_by_row(
     """For every journey names of fates, and which of them each of its sign detections had."""
     is_certain = result.hd_map.signs.confidence >= config.min_confidence
     outliers = {found.journey for found in result.first.crowd.report.outlier_journeys}
-    trusted = trusted_frames(dataset.journeys, result.first.crowd)
+    trusted = result.first.crowd.trusted_frames(dataset.journeys)
     for number, (journey, made, found) in enumerate(
         zip(dataset.journeys, result.journey_maps, result.associations, strict=True)
     ):
@@ -119,7 +119,7 @@ def lane_fates(dataset: Dataset, result: MapResult) -> Counter[str]:
     every = torch.ones(len(result.hd_map.lanes), dtype=torch.bool)
     outliers = {found.journey for found in result.first.crowd.report.outlier_journeys}
     total = _dropped(dataset, DROPPED_LANE)
-    trusted = trusted_frames(dataset.journeys, result.first.crowd)
+    trusted = result.first.crowd.trusted_frames(dataset.journeys)
     for number, (journey, made, found) in enumerate(
         zip(dataset.journeys, result.journey_maps, result.associations, strict=True)
     ):

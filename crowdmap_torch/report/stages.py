@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_count
-from crowdmap_torch.mapper import FirstMap, JourneyMap
+from crowdmap_torch.mapper import FirstMap, JourneyMap, KeepCall
 from crowdmap_torch.report.plots import Eigengap, plot_eigengaps
 from crowdmap_torch.report.summaries import outages_of, outlier_journeys_of
 from crowdmap_torch.report.tensorboard import TensorBoardLog
@@ -17,7 +17,6 @@ from crowdmap_torch.tables import Dataset, Journey, Tracklets
 
 _EIGENVALUES_SHOWN = 60
 """Beyond a gap."""
-KeepCall = Callable[[int, JourneyMap], object]
 
 
 def keep_and_log(keep: KeepCall, log: TensorBoardLog, journeys: Sequence[Journey]) -> KeepCall:

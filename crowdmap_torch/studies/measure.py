@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.benchmark.association import sign_associations
 from crowdmap_torch.clustering.groups import group_mode
 from crowdmap_torch.config import MapperConfig
@@ -28,14 +27,7 @@ from crowdmap_torch.io.documents import plain, read_json
 from crowdmap_torch.io.maps import certain_part
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import JourneyTruth, Truth, read_truth
-from crowdmap_torch.mapper import (
-    JourneyMap,
-    build_bundle,
-    clusters_map,
-    finish_map,
-    first_map,
-    made_anew,
-)
+from crowdmap_torch.mapper import JourneyMap, adjusted_map, clusters_map, first_map
 from crowdmap_torch.noise.pose_prior import variance_of_mean
 from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.studies.recovered import recovered
@@ -121,15 +113,7 @@ def measure_map(
     begun = time.process_time()
     pins = spread_signs(drives.survey, observable, control)
     known = drives.survey.signs[pins] if control else None
-    last = first
-    while True:
-        bundle = build_bundle(journeys, maps, last, config, control=known)
-        state = adjust.adjust(bundle)
-        again = made_anew(journeys, maps, last, bundle, config)
-        if again is None:
-            break
-        last = again
-    result = finish_map(dataset, maps, last, bundle, state, config, heads=first)
+    result = adjusted_map(dataset, maps, first, config, control=known)
     seconds["adjusted"] = time.process_time() - begun
     names = tuple(drives.survey.sign_id[row] for row in pins.tolist())
     final = certain_part(result.hd_map, config.min_confidence)
