@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import distinct_pairs, group_count, pairs_within
+from crowdmap_torch.clustering.groups import distinct_pairs, group_argmin, group_count, pairs_within
 from crowdmap_torch.clustering.neighbours import near_pairs
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance, sign_distance
 from crowdmap_torch.crowd_signs.merge import mutual_partners
@@ -88,13 +88,8 @@ def same_sign(
             break
         label = mutual_partners(group, cost[one], len(signs))[label]
     number = sum((group_count(a.sign, len(signs)) for a in associations), torch.zeros_like(label))
-    # Of equals the first.
-    order = (-number).argsort(stable=True)
-    order = order[label[order].argsort(stable=True)]
-    leads = torch.ones_like(label, dtype=torch.bool)
-    leads[1:] = label[order][1:] != label[order][:-1]
-    lead = order[leads][leads.cumsum(0) - 1]
-    return torch.empty_like(label).index_put((order,), lead)
+    _, own = torch.unique(label, return_inverse=True)
+    return group_argmin(-number.to(cost), own)[own]
 
 
 def _alike(signs: Signs, config: DuplicateSignConfig) -> Int[Tensor, "p 2"]:
