@@ -70,17 +70,27 @@ def test_what_is_sent_is_as_large_as_its_tensors() -> None:
     assert torch.equal(pickle.loads(sent), resting.more["n"])
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is read from /proc")
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="memory is read from /proc")
 def test_memory_is_a_files() -> None:
-    def anonymous() -> int:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
+    def anonymous(tensor: Tensor) -> int:
+        """Kilobytes of the mapping that holds the tensor that are this process's alone, not a file's."""
+        found = False
+        for line in Path("/proc/self/smaps").read_text().splitlines():
+            name, _, rest_of_line = line.partition(" ")
+            if not name.endswith(":"):
+                first, _, last = name.partition("-")
+                found = int(first, 16) <= tensor.data_ptr() < int(last, 16)
+            elif found and name == "Anonymous:":
+                return int(rest_of_line.split()[0])
+        raise AssertionError("no mapping holds the tensor")
 
-    before = anonymous()
-    resting = rest(Held("x", torch.ones(8_000_000, dtype=torch.float64), (), {}))
-    # 64 MB, of which nothing is left in memory that is this process's alone.
-    assert anonymous() - before < 16_000
+    given = torch.ones(8_000_000, dtype=torch.float64)
+    resting = rest(Held("x", given, (), {}))
     assert float(resting.column.sum()) == 8e6
+    assert anonymous(given) >= 62_500
+    assert anonymous(resting.column) == 0
+    resting.column[:1000] = 2.0
+    assert 0 < anonymous(resting.column) < 64
 
 
 def test_where_there_is_no_disk_it_stays_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
