@@ -276,34 +276,34 @@ class PosePrior:
         pairs = pairs * told[:, :6]
         # Of drift, rotation and wander: sums of squared changes, how many they are, and variances as given.
         chains = list(zip(changes.split(3, 1), pairs.split(3, 1), (slides, rolls), strict=True))
-        slow = [self._share_of_mean(self.length_m[:, :3]) * slides, None]
+        slow = [self._share_of_mean(self.length_m[:, :3]) * slides, torch.zeros_like(slides)]
         if self.wander is not None:
             wander, squares = self.wander, self.wander.sigma.square()
             expected = wander.expected_changes(wander.far, self.nodes.way, own)
             changes, pairs = self._changes(drift[:, 6:], wander.far, expected, journeys)
             chains.append((changes, pairs * told[:, 6:], squares))
             slow.append(self._share_of_mean(torch.full_like(squares, wander.length_m)) * squares)
+        changes, pairs, given = (torch.stack(each) for each in zip(*chains, strict=True))
+        of_mean, given_bias = torch.stack(slow), self.bias_sigma[:, :3].square()
         count = torch.bincount(own, minlength=journeys).to(drift)[:, None]
         mean = self.nodes.mean(drift[:, :3], journeys)
         seen = count.clamp_max(1).expand(-1, 3)
-        found, likely = list(scale.square().unbind(1)), list(drift.new_ones(self.scale_count))
-        wider = torch.ones_like(scale)
+        bias, found = scale.square().T.split((1, len(chains)))
+        likely, wider = drift.new_ones(len(chains)), torch.ones_like(found)
+        likely_bias, wider_bias = drift.new_ones(1), torch.ones_like(bias)
+        strengths = config.scale_strength, config.scale_trust
         for _ in range(_SWEEPS):
-            for k, (changes, pairs, squares) in enumerate(chains, 1):
-                variance = found[k][:, None] * squares
-                found[k], likely[k], wider[:, k] = pooled(
-                    likely[k], changes, pairs, variance, config.scale_strength, config.scale_trust
-                )
-            spread = found[0][:, None] * self.bias_sigma[:, :3].square()
-            for of_mean, of_chain in zip(slow, found[1:], strict=True):
-                spread = spread if of_mean is None else spread + of_chain[:, None] * of_mean
+            variance = found[..., None] * given
+            found, likely, wider = pooled(likely, changes, pairs, variance, *strengths)
+            of_bias = bias[0, :, None] * given_bias
+            spread = of_bias + (found[..., None] * of_mean).sum(0)
             weight = seen / spread
             common = (weight * mean).sum(0) / weight.sum(0).clamp_min(1e-12)
-            squares = seen * found[0][:, None] * (mean - common).square() / spread
-            found[0], likely[0], wider[:, 0] = pooled(
-                likely[0], squares, seen, spread, config.scale_strength, config.scale_trust
+            squares = seen * bias[0, :, None] * (mean - common).square() / spread
+            bias, likely_bias, wider_bias = pooled(
+                likely_bias, squares[None], seen[None], spread[None], *strengths
             )
-        return torch.stack(found, dim=1).sqrt(), wider
+        return torch.cat((bias, found)).T.sqrt(), torch.cat((wider_bias, wider)).T
 
     def _changes(
         self,
