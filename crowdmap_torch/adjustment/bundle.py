@@ -193,17 +193,17 @@ class Bundle(BundleState):
         return moved
 
     @torch.no_grad()
-    def judge(self, backend: MapBackend) -> bool:
+    def judge(self, equations: MapEquations) -> bool:
         """Gives detections up that everything else is too much against, at the minimum; returns whether any changed.
 
         What they are judged by is their innovation: of the nearest view of a sign the residual says little, as the pose
-        goes where that view wants it. From the first time on the bound on residuals is as narrow as it is to be.
+        goes where that view wants it. How well poses are known the `equations` tell that were solved last. From the first
+        time on the bound on residuals is as narrow as it is to be.
         """
         if self.config.method == "paper2017" or int(self.judged) >= _MOST_JUDGEMENTS:
             return False
         problem, values, given_up = self.problem(), self.values(), torch.zeros_like(self.given_up)
         if self.config.innovation_chance and len(self.whole.corners):
-            equations = backend.assemble(problem, values)
             if len(self.corners):
                 of_pose = equations.conditional_covariance("pose")
                 term = problem.terms["sign_reprojection"]

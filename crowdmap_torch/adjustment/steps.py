@@ -37,7 +37,8 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     """One step of the solver, folded into the bundle, and whether the adjustment is finished.
 
     Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
-    first come to rest, and when the solver stops. It is finished when that changes nothing.
+    first come to rest, and when the solver stops. It is finished when that changes nothing, or no more than is lost in how
+    little is known.
     """
     problem = bundle.problem()
     normal = state.normal
@@ -49,12 +50,15 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
         return state, state.done
     evidence = bundle.evidence() or bundle.told_by(normal)
     of_border = normal.border_information() if bundle.fleet.kinds else None
-    # The next ones may need memory of their own.
-    del normal
     bundle.fold(dict(state.values))
     at_rest = bundle.refresh(evidence, of_border)
-    if at_rest and (state.done or int(bundle.judged) == 0):
-        at_rest = not bundle.judge(backend)
+    if at_rest and (state.done or int(bundle.judged) == 0) and bundle.judge(normal):
+        if state.done:
+            state = lm.settled(bundle.problem(), state, normal, bundle.config.lm)
+        at_rest = state.done
+        if at_rest:
+            bundle.fold(dict(state.values))
+            at_rest = bundle.refresh(evidence)
     if state.done and at_rest:
         return state, True
     return lm.changed(state), False

@@ -117,7 +117,7 @@ def corrected(
         return problem.dot(one, other, step)
 
     for count in range(1, most + 1):
-        new = packed(normal.correct(unpacked(here.gradient, step)), step)
+        new = packed(normal.correct(unpacked(here.gradient, step)).delta, step)
         pair = _Pair.of(dot, move, lifted, here.gradient - gradient, newton - new)
         pairs, gradient, newton = (*pairs, pair), here.gradient, new
         move, lifted = _quasi_newton(dot, gradient, newton, pairs)

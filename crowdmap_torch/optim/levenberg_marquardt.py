@@ -17,6 +17,7 @@ from torch import Tensor
 from crowdmap_torch.optim.corrections import Point, corrected
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
+from crowdmap_torch.optim.solvers.assembly import cost_and_gradient
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import (
     Backend,
@@ -279,6 +280,33 @@ def changed(state: LmState) -> LmState:
     """The state for a problem that changed (matches refreshed, scales narrowed): linearised anew, running again."""
     reason = torch.where(state.reason == NOT_FINITE, state.reason, RUNNING)
     return replace(state, normal=None, reason=reason)
+
+
+def settled(problem: Problem, state: LmState, normal: NormalEquations, config: LmConfig) -> LmState:
+    """The state, which was done, for a problem that has changed a little since: done again, by one more step.
+
+    The step is that of the factors of `normal`, the equations that were solved last, at the new gradient. Where it does
+    not lower the cost, or would move what is solved for last by its tolerance or more, the state is as after `changed`.
+    """
+    again = changed(state)
+    if not isinstance(normal, Correctable) or bool((state.damping > _UNDAMPED).any()):
+        return again
+    costs, gradient = cost_and_gradient(problem, state.values)
+    step = normal.correct(gradient)
+    if not bool((step.in_sigmas < config.move_tolerance).all()):
+        return again
+    whole = torch.ones_like(state.damping)
+    values, term_cost, cost = _trial(problem, state.values, step.delta, whole)
+    if not bool((cost < costs.total).all()):
+        return again
+    return replace(
+        again,
+        values=values,
+        cost=cost,
+        term_cost=term_cost,
+        corrections=state.corrections + 1,
+        reason=torch.full_like(state.reason, CONVERGED_MOVE),
+    )
 
 
 def solve(

@@ -106,4 +106,25 @@ def test_the_papers_cost_weighs_every_corner_and_lane_point_by_itself_and_all_pi
         total = sum(tukey(row) for row in residual.tolist())
         assert found[name] == pytest.approx(total, rel=1e-9)
     # Nothing else is judged, and what was found stays.
-    assert not bundle.judge(bundle.backend()) and not bundle.given_up.any()
+    equations = bundle.backend().assemble(bundle.problem(), values)
+    assert not bundle.judge(equations) and not bundle.given_up.any()
+
+
+def test_judging_asks_the_equations_that_were_solved_and_not_for_others(
+    build: Callable[[], Bundle], monkeypatch: pytest.MonkeyPatch
+):
+    bundle = build()
+    backend, made, solved = bundle.backend(), [], []
+    assemble = backend.assemble
+
+    def counted(*args):
+        made.append(assemble(*args))
+        return made[-1]
+
+    monkeypatch.setattr(backend, "assemble", counted)
+    for step, state in adjust.steps(bundle, adjust.start(bundle)):
+        solved.append(state)
+        assert len(made) == step + 1
+    assert int(bundle.judged) == 2 and solved[-1].done
+    # The last detections that were given up are told apart from the map by a correction, where that is all it takes.
+    assert solved[-1].linearizations == len(solved)

@@ -16,7 +16,7 @@ from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.assembly import cost_and_gradient
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
-from crowdmap_torch.optim.solvers.normal_equations import StepPart, solved_step
+from crowdmap_torch.optim.solvers.normal_equations import Correction, StepPart, solved_step
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 
 CONFIG = lm.LmConfig(max_iterations=40, cost_tolerance=1e-10, initial_damping=1e-9, max_stretch=3.0)
@@ -110,7 +110,9 @@ class _Rough:
 
     def correct(self, gradient):
         self.asked.append(gradient)
-        return {"x": -torch.linalg.solve(self.matrix, gradient["x"][0])[None]}
+        step = -torch.linalg.solve(self.matrix, gradient["x"][0])
+        in_sigmas = (-(step @ gradient["x"][0]) / len(step)).sqrt()
+        return Correction({"x": step[None]}, in_sigmas[None])
 
 
 def _bowl(sides=(1.0, 3.0, 10.0)):
@@ -131,7 +133,7 @@ def _bowl(sides=(1.0, 3.0, 10.0)):
 
 def test_pairs_find_the_minimum_of_a_bowl_whatever_the_matrix():
     problem, values, normal = _bowl()
-    step = normal.correct(normal.tangent_gradient)
+    step = normal.correct(normal.tangent_gradient).delta
     first = Point.of(problem, {"x": values["x"] + step["x"]}, step)
     found = corrected(problem, normal, step, first, most=12, cost_tolerance=1e-12)
     # A matrix alone, right to a factor of two, halves what is left at each step: 2^-24 of the cost after twelve.
@@ -141,7 +143,7 @@ def test_pairs_find_the_minimum_of_a_bowl_whatever_the_matrix():
 
 def test_a_correction_that_raises_the_cost_is_not_taken():
     problem, values, normal = _bowl()
-    step = normal.correct(normal.tangent_gradient)
+    step = normal.correct(normal.tangent_gradient).delta
     first = Point.of(problem, {"x": values["x"] + step["x"]}, step)
     # A matrix that is far too small sends the next step far beyond the minimum.
     normal.matrix = normal.matrix / 1e3
@@ -164,7 +166,8 @@ def test_where_corrections_fail_the_step_is_made_longer():
     problem, values, normal = _bowl()
     # Twice the curvature everywhere: the step leads half the way, and its factors are lost.
     normal.matrix = 2 * DenseBackend().assemble(problem, values).hessian[0]
-    normal.correct = lambda gradient: {"x": torch.full_like(gradient["x"], torch.nan)}
+    nothing = torch.full((1,), torch.nan)
+    normal.correct = lambda gradient: Correction({"x": nothing * gradient["x"]}, nothing)
     config = replace(CONFIG, corrections=5, correct_below=1.0)
     state = lm.init(problem, values, config)
     state = lm.step(problem, state, config, backend=_OnlyOnce(normal))
@@ -179,3 +182,37 @@ def test_equations_without_kept_factors_take_plain_steps():
     state = lm.solve(problem, values, config, backend=DenseBackend())
     assert state.done
     assert state.corrections == 0
+
+
+def test_a_problem_that_changed_a_little_is_settled_by_one_correction(race):
+    built, values, backend = race
+    config = replace(CONFIG, cost_tolerance=1e-8, move_tolerance=0.05)
+    state, normal = lm.init(built, values, config), backend.assemble(built, values)
+    while not state.done:
+        normal = backend.assemble(built, state.values)
+        state = lm.step(built, replace(state, normal=normal), config, backend=backend)
+
+    def changed(factor):
+        corner = built.terms["corner"]
+        corner = replace(corner, loss=Tukey(corner.loss.c * factor))
+        return replace(built, terms={**built.terms, "corner": corner})
+
+    little = changed(1.02)
+    settled = lm.settled(little, state, normal, config)
+    assert settled.reasons == ("converged: the step is lost in how little is known",)
+    assert settled.corrections == state.corrections + 1 and settled.iterations == state.iterations
+    costs, gradient = cost_and_gradient(little, settled.values)
+    torch.testing.assert_close(settled.cost, costs.total)
+    before, was = cost_and_gradient(little, state.values)
+    assert float(costs.total) < float(before.total)
+    assert gradient["point"].norm() < 0.5 * was["point"].norm()
+    # More than that is for steps of its own, and so is what has nothing to be corrected by.
+    for problem, by in (
+        (changed(0.3), normal),
+        (little, DenseBackend().assemble(little, state.values)),
+    ):
+        left = lm.settled(problem, state, by, config)
+        assert left.reasons == ("still running",) and left.corrections == state.corrections
+        assert left.values is state.values
+    damped = replace(state, damping=torch.full_like(state.damping, 1e-3))
+    assert not lm.settled(little, damped, normal, config).done

@@ -48,10 +48,12 @@ from crowdmap_torch.optim.solvers.normal_equations import (
     DIAGONAL_FLOOR,
     BorderInformation,
     ChainChanges,
+    Correction,
     Step,
     StepPart,
     Tangents,
     failed_step,
+    mean_in_sigmas,
     solved_step,
 )
 from crowdmap_torch.optim.solvers.parts import Part
@@ -175,11 +177,14 @@ class ChainNormalEquations:
         """The gradient by variable."""
         return self.unpack(self.eliminated_gradient, self.gradient)
 
-    def correct(self, gradient: Tangents) -> dict[str, Tensor]:
+    def correct(self, gradient: Tangents) -> Correction:
         """The step for another gradient, by the last factors."""
-        a, b = self.structure.stack(gradient), self.structure.where.pack(gradient)[0]
-        y = -self.solve_reduced((b - self.couple_all(self.solve_alone(a)))[:, None])[:, 0]
-        return self.unpack(self.substitute(y, a), y)
+        where = self.structure.where
+        a, b = self.structure.stack(gradient), where.pack(gradient)[0]
+        right_side = b - self.couple_all(self.solve_alone(a))
+        y = -self.solve_reduced(right_side[:, None])[:, 0]
+        in_sigmas = mean_in_sigmas(-(right_side @ y)[None], where.used.sum(1).to(y))
+        return Correction(self.unpack(self.substitute(y, a), y), in_sigmas)
 
     def unpack(self, x: Float[Tensor, "e k ..."], y: Float[Tensor, "r ..."]) -> dict[str, Tensor]:
         """Tangents by variable."""

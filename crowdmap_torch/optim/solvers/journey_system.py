@@ -34,9 +34,11 @@ from crowdmap_torch.optim.solvers.normal_equations import (
     DIAGONAL_FLOOR,
     BorderInformation,
     ChainChanges,
+    Correction,
     Step,
     Tangents,
     failed_step,
+    mean_in_sigmas,
 )
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
@@ -211,13 +213,12 @@ class JourneyEquations:
         along, damped, squared = together.sum(of_x + of_y if together.leads else of_x).split(1)
         norm = squared.sqrt()
         solved = norm.isfinite()
-        count = own.structure.where.used.sum(1).to(y)
         return Step(
             delta=own.unpack(x, y),
             predicted=torch.where(solved, (damped - along) / 2, 0.0),
             solved=solved,
             norm=norm,
-            in_sigmas=(along_last / count.clamp_min(1)).clamp_min(0).sqrt(),
+            in_sigmas=mean_in_sigmas(along_last, own.structure.where.used.sum(1).to(y)),
         )
 
     def _system(self, added_x: Float[Tensor, "e k"]) -> JourneySystem:
@@ -229,19 +230,21 @@ class JourneyEquations:
         """The gradient by variable, of all."""
         return self.own.unpack(self.own.eliminated_gradient, self.gradient)
 
-    def correct(self, gradient: Tangents) -> dict[str, Tensor]:
+    def correct(self, gradient: Tangents) -> Correction:
         """The step for another gradient, by the last factors."""
         own = self.own
         a, b = own.structure.stack(gradient), own.structure.where.pack(gradient)[0]
 
-        def stepped(parts: Iterator[Float[Tensor, " r"]]) -> Float[Tensor, " r"]:
+        def stepped(parts: Iterator[Float[Tensor, " r"]]) -> tuple[Tensor, Tensor]:
             right_side = b.clone()
             for part in parts:
                 right_side -= part
-            return -self.summed.solve(right_side)
+            y = -self.summed.solve(right_side)
+            return y, -(right_side @ y)[None]
 
-        y = self.together.met(stepped, own.couple_all(own.solve_alone(a)))
-        return own.unpack(own.substitute(y, a), y)
+        y, along_last = self.together.met(stepped, own.couple_all(own.solve_alone(a)))
+        in_sigmas = mean_in_sigmas(along_last, own.structure.where.used.sum(1).to(y))
+        return Correction(own.unpack(own.substitute(y, a), y), in_sigmas)
 
     def covariance(self, *, floor: float = UNOBSERVED_FLOOR) -> LandmarkCovariance:
         """The joint covariance of all that stays: the leader's, while members `share_covariance`."""

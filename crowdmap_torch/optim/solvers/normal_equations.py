@@ -93,7 +93,14 @@ def _in_sigmas(
     along = torch.stack([(of.gradient * of.step).flatten(1).sum(1) for of in last]).sum(0)
     if count is None:
         count = torch.full_like(along, sum(of.step[0].numel() for of in last))
-    return (-along / count.clamp_min(1)).clamp_min(0).sqrt()
+    return mean_in_sigmas(-along, count)
+
+
+def mean_in_sigmas(
+    squared: Float[Tensor, " groups"], count: Float[Tensor, " groups"]
+) -> Float[Tensor, " groups"]:
+    """The root mean square of a step's sigmas, by their sum of squares s.S s over so many numbers."""
+    return (squared / count.clamp_min(1)).clamp_min(0).sqrt()
 
 
 def failed_step(like: Tangents, cost: Float[Tensor, " groups"]) -> Step:
@@ -217,6 +224,15 @@ class BorderInformation:
         return self.matrix[own[:, None], own] - across.mT @ torch.cholesky_solve(across, factor)
 
 
+@dataclass(frozen=True)
+class Correction:
+    """A step by the factors of an earlier one."""
+
+    delta: Tangents
+    in_sigmas: Float[Tensor, " 1"]
+    """As of a `Step`."""
+
+
 @runtime_checkable
 class Correctable(NormalEquations, Protocol):
     """Those of one problem whose last factors serve other gradients too."""
@@ -226,7 +242,7 @@ class Correctable(NormalEquations, Protocol):
         """The gradient by variable."""
         ...
 
-    def correct(self, gradient: Tangents) -> Tangents:
+    def correct(self, gradient: Tangents) -> Correction:
         """The step for another gradient, by the factors of the last `solve`."""
         ...
 
