@@ -128,7 +128,9 @@ class Bundle(BundleState):
             pose = values["pose"][self.lane_points.frame]
             splines = values["lane"], self.lane_count
             begun = self._match_begun
-            found = follow(self.matches, self.lane_points, pose, *splines, begun=begun)
+            shifts = self.fleet.shifts(self.lane_points, self._by_optics[1], values)
+            how = {"shifts": shifts, "begun": begun}
+            found = follow(self.matches, self.lane_points, pose, *splines, **how)
             self.match_t, self.match_normal = found.t, found.normal_px
             self.match_valid = found.valid
         self.relinearise()

@@ -18,12 +18,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from crowdmap_torch.adjustment.lane_matching import Shifts
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.clustering.groups import group_sum
 from crowdmap_torch.geometry.camera import Camera
@@ -32,6 +33,10 @@ from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.ranges import Degrees, LengthOrNone, PixelsOrNone, Settings, Share
 from crowdmap_torch.residuals.calibration import with_linear_part
+from crowdmap_torch.residuals.lane import (
+    lane_reprojection_by_car,
+    lane_reprojection_by_car_jacobian,
+)
 from crowdmap_torch.residuals.reprojection import pixel_error_jacobian
 from crowdmap_torch.tables import Journey
 
@@ -148,15 +153,18 @@ class ByOptics:
     """Derivatives of rows by the optics of their cars, in units of the configuration's sigmas."""
 
     image: Float[Tensor, "m 2 k"]
-    """Of the pixel."""
+    """Of the pixel, as long as what is seen is where it is."""
     height: Float[Tensor, "m _ k"]
     """Of a lane point's height over the road; nothing for corners."""
+    left: Float[Tensor, "_ 3"]
+    """Along the camera's axes, to where a lane point is detected that is not on its marker; nothing for corners."""
 
     @classmethod
     def none(cls, count: int, config: CalibrationConfig, like: Tensor, heights: int) -> ByOptics:
         """Those of rows of which nothing is known yet."""
         k = width("optics", config)
-        return cls(like.new_zeros(count, 2, k), like.new_zeros(count, heights, k))
+        by = like.new_zeros(count, 2, k), like.new_zeros(count, heights, k)
+        return cls(*by, like.new_zeros(count * heights, 3))
 
 
 @dataclass(frozen=True)
@@ -232,13 +240,35 @@ class Fleet:
         image, ground = terms["lane_reprojection"], terms["lane_height"]
         if "optics" in self.variables:
             car = self.of_pose[rows.frame]
-            across = (normal_px[:, :, None] * by.image).sum(1, keepdim=True)
-            image = with_linear_part(image, "optics", car, across)
+            across = (normal_px[:, :, None] * by.image).sum(1)
+            image = replace(
+                image,
+                residual=lane_reprojection_by_car,
+                slots=(*image.slots, ("optics", car)),
+                constants=(*image.constants, by.left, self._left_m.expand_as(across), across),
+                jacobian=lane_reprojection_by_car_jacobian,
+            )
             ground = with_linear_part(ground, "optics", car, by.height)
         if self.config.load_m:
             higher = rows.camera_height.new_full((len(rows), 1, 1), -self.config.load_m)
             ground = with_linear_part(ground, LOAD, rows.journey, higher)
         return {"lane_reprojection": image, "lane_height": ground}
+
+    @property
+    def _left_m(self) -> Float[Tensor, " k"]:
+        """By how many metres each number of the optics has lane points to the left."""
+        left_m = self.velocity.new_zeros(width("optics", self.config))
+        left_m[columns("optics", self.config).get("lane_m", slice(0))] = self.config.lane_m
+        return left_m
+
+    def shifts(
+        self, rows: LanePointObservations, by: ByOptics, values: Mapping[str, Tensor]
+    ) -> Shifts | None:
+        """Where the true cameras and detectors see lane points; None: as stated."""
+        if "optics" not in self.variables:
+            return None
+        optics = values["optics"][self.of_pose[rows.frame], :, None]
+        return Shifts(by.left * (self._left_m @ optics), (by.image @ optics)[..., 0])
 
     def by_mount(self, pose: Float[Tensor, "p 4 4"]) -> Float[Tensor, "p 6 k"]:
         """Derivatives of what the poses given are wrong by, as tangents of geometry.se3, where the poses are `pose`.
@@ -287,15 +317,13 @@ class Fleet:
             by[..., at["box"]] = (seen - _means(seen, rows.detection))[..., None] * config.box
         if "corner_px" in at and of_corners:
             by[..., at["corner_px"]] = torch.eye(2).to(by) * config.corner_px
-        if "lane_m" in at and not of_corners:
-            ahead = torch.zeros_like(point_camera)
-            ahead[:, 2] = 1
-            left = torch.linalg.cross(-rows.normal_camera, ahead)
-            left = torch.nn.functional.normalize(left, dim=-1)
-            by[..., at["lane_m"]] = (by_point @ left[..., None]) * config.lane_m
         if isinstance(rows, CornerObservations):
-            return ByOptics(by, by[:, :0])
-        return ByOptics(by, self._by_height(rows, lenses, point_camera))
+            return ByOptics(by, by[:, :0], point_camera[:0])
+        ahead = torch.zeros_like(point_camera)
+        ahead[:, 2] = 1
+        left = torch.linalg.cross(-rows.normal_camera, ahead)
+        left = torch.nn.functional.normalize(left, dim=-1)
+        return ByOptics(by, self._by_height(rows, lenses, point_camera), left)
 
     def _by_height(
         self,

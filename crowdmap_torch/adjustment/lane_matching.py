@@ -46,6 +46,16 @@ class LaneMatches(Rows):
         return coefficient, weight
 
 
+@dataclass(frozen=True)
+class Shifts(Rows):
+    """What lies between a spline point and where a true camera and its detector see it, beside what is stated of them."""
+
+    camera: Float[Tensor, "m 3"]
+    """Of the point, along the camera's axes [m]."""
+    px: Float[Tensor, "m 2"]
+    """Of the pixel, where that point is seen."""
+
+
 def nearest_lanes(
     point_world: Float[Tensor, "m 3"],
     lanes: Lanes,
@@ -133,19 +143,21 @@ def follow(
     coefficient: Float[Tensor, "c 3"],
     count: Int[Tensor, " n"],
     *,
+    shifts: Shifts | None = None,
     begun: Float[Tensor, " m"] | None = None,
 ) -> LaneMatches:
     """The matches moved to the closest points of the projected splines, from where they were (V-B).
 
-    Done between steps of the solver: inside the residual it would make the Jacobian jump. Those that had `begun` with these
-    parameters slide no further than the stretches between control points next to theirs.
+    Closest is what is seen, by cameras and detectors with their `shifts`: there alone does the error not depend on where
+    along the spline it is taken. Done between steps of the solver: inside the residual it would make the Jacobian jump.
+    Those that had `begun` with these parameters slide no further than the stretches between control points next to theirs.
     """
 
     def some(at: slice) -> LaneMatches:
         where = T_world_camera[at], coefficient, count
-        return _followed(
-            matches[at], observations[at], *where, None if begun is None else begun[at]
-        )
+        own = None if shifts is None else shifts[at]
+        first = None if begun is None else begun[at]
+        return _followed(matches[at], observations[at], *where, own, first)
 
     every = [slice(a, a + _AT_ONCE) for a in range(0, len(matches), _AT_ONCE)]
     return concatenate(list(in_order(some, every, coefficient.device))) if every else matches
@@ -157,14 +169,19 @@ def _followed(
     T_world_camera: Float[Tensor, "m 4 4"],
     coefficient: Float[Tensor, "c 3"],
     count: Int[Tensor, " n"],
+    shifts: Shifts | None,
     begun: Float[Tensor, " m"] | None,
 ) -> LaneMatches:
     """The same of a few: at once they fit a processor's cache."""
     start = spline_basis.starts(count)[matches.lane]
     own = count[matches.lane]
     t = matches.t
-    M = observations.matrix @ T_world_camera[:, :3, :3].mT
-    position = T_world_camera[:, :3, 3]
+    R = T_world_camera[:, :3, :3]
+    position, shift_px = T_world_camera[:, :3, 3], torch.zeros_like(matches.normal_px)
+    if shifts is not None:
+        position = position - (R @ shifts.camera[..., None])[..., 0]
+        shift_px = shifts.px
+    M = observations.matrix @ R.mT
     last = (own - 1).to(t)
     # Half a knot beyond either end is far enough to see that the point is not on this spline.
     least, most = torch.full_like(t, -0.5), last + 0.5
@@ -174,7 +191,7 @@ def _followed(
         most = torch.minimum(most, torch.nextafter(begun + 2, begun))
     y, error, tangent = _projected(t, start, own, coefficient, M, position)
     for _ in range(_STEPS):
-        change = (error * tangent).sum(-1) / tangent.square().sum(-1).clamp_min(1e-12)
+        change = ((error + shift_px) * tangent).sum(-1) / tangent.square().sum(-1).clamp_min(1e-12)
         t = torch.minimum(torch.maximum(t - change.clamp(-2, 2), least), most)
         y, error, tangent = _projected(t, start, own, coefficient, M, position)
     tangent = torch.nn.functional.normalize(tangent, dim=-1)

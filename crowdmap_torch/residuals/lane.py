@@ -38,6 +38,31 @@ def lane_reprojection(
     return _along(normal_px, pixel_error(point, observation))
 
 
+def lane_reprojection_by_car(
+    T_world_camera: Float[Tensor, "4 4 *#rows"],
+    c0: Float[Tensor, "3 *#rows"],
+    c1: Float[Tensor, "3 *#rows"],
+    c2: Float[Tensor, "3 *#rows"],
+    c3: Float[Tensor, "3 *#rows"],
+    optics: Float[Tensor, "k *#rows"],
+    weights: Float[Tensor, "4 *#rows"],
+    normal_px: Float[Tensor, "2 *#rows"],
+    observation: Float[Tensor, "3 3 *#rows"],
+    left_camera: Float[Tensor, "3 *#rows"],
+    left_m: Float[Tensor, "k *#rows"],
+    by_optics: Float[Tensor, "k *#rows"],
+) -> Float[Tensor, "1 *#rows"]:
+    """`lane_reprojection` by a car whose camera and detector have the errors `optics`.
+
+    They make it see the spline point by `left_m . optics` metres to the left, along `left_camera`, and move what is seen by
+    `by_optics . optics` pixels along the image normal. Markers that are detected to the left and markers that lie there
+    look the same: so do they here, wherever a step may take them.
+    """
+    point = into_camera(T_world_camera, _spline_point((c0, c1, c2, c3), weights))
+    seen = point + left_camera * (left_m * optics).sum(0)
+    return _along(normal_px, pixel_error(seen, observation)) + (by_optics * optics).sum(0)
+
+
 def lane_height(
     T_world_camera: Float[Tensor, "4 4 *#rows"],
     c0: Float[Tensor, "3 *#rows"],
@@ -110,6 +135,30 @@ def lane_reprojection_jacobian(
     # The image normal makes one row of two before the chain rule goes on.
     by_camera = _along(normal_px, by_camera)
     return _along(normal_px, error), _by_pose_and_spline(T_world_camera, point, by_camera, weights)
+
+
+def lane_reprojection_by_car_jacobian(
+    T_world_camera: Float[Tensor, "4 4 m"],
+    c0: Float[Tensor, "3 m"],
+    c1: Float[Tensor, "3 m"],
+    c2: Float[Tensor, "3 m"],
+    c3: Float[Tensor, "3 m"],
+    optics: Float[Tensor, "k m"],
+    weights: Float[Tensor, "4 m"],
+    normal_px: Float[Tensor, "2 m"],
+    observation: Float[Tensor, "3 3 m"],
+    left_camera: Float[Tensor, "3 m"],
+    left_m: Float[Tensor, "k m"],
+    by_optics: Float[Tensor, "k m"],
+) -> tuple[Float[Tensor, "1 m"], tuple[Jacobian, ...]]:
+    """`lane_reprojection_by_car` and its Jacobians by camera pose, the four coefficients and the optics."""
+    point = into_camera(T_world_camera, _spline_point((c0, c1, c2, c3), weights))
+    seen = torch.addcmul(point, left_camera, (left_m * optics).sum(0))
+    error, by_camera = pixel_error_jacobian(seen, observation)
+    by_camera = _along(normal_px, by_camera)
+    by_car = torch.addcmul(by_optics, left_m, (by_camera[0] * left_camera).sum(0))
+    by_slot = *_by_pose_and_spline(T_world_camera, point, by_camera, weights), by_car[None]
+    return _along(normal_px, error) + (by_optics * optics).sum(0), by_slot
 
 
 def lane_height_jacobian(

@@ -11,6 +11,7 @@ from worlds.small_world import Builder
 
 from crowdmap_torch.adjustment.lane_matching import (
     LaneMatches,
+    Shifts,
     detection_lanes,
     follow,
     nearest_lanes,
@@ -222,6 +223,34 @@ def test_follow_stays_where_the_match_is_right_already(lanes: Lanes):
     once = follow(start, rows, T.expand(10, 4, 4), coefficient, count)
     twice = follow(once, rows, T.expand(10, 4, 4), coefficient, count)
     assert (twice.t - once.t).abs().max() < 1e-3
+
+
+def test_follow_looks_for_what_the_true_camera_sees(lanes: Lanes):
+    T = camera_at(5.0)
+    x = torch.linspace(16, 40, 10, dtype=torch.float64)
+    px = pixels_beside(lanes, T, 0.2 * torch.sin(x), x, 2)
+    count = lanes.control_count
+    coefficient = spline_basis.to_coefficients_flat(lanes.control.point_world, count)
+    nothing = torch.zeros(10, 2, dtype=torch.float64)
+    start = LaneMatches(torch.full((10,), 2), x / 60 * 8, nothing, nothing[:, 0] > 0)
+    shift_px = torch.stack((3 * torch.cos(x), 5 * torch.sin(2 * x)), dim=-1)
+    shift = 0.3 * torch.stack((torch.cos(x), torch.sin(x), torch.cos(3 * x)), dim=-1)
+
+    # Seen beside where it should be, a point is where it would have been seen there.
+    rows, where = observe(px), (T.expand(10, 4, 4), coefficient, count)
+    found = follow(start, rows, *where, shifts=Shifts(torch.zeros_like(shift), shift_px))
+    expected = follow(start, observe(px - shift_px), *where)
+    # The lens there is a little different.
+    assert (found.t - expected.t).abs().max() < 2e-4
+    assert (found.t - follow(start, rows, *where).t).abs().max() > 0.1
+
+    # The spline to one side of the camera, or the camera to the other.
+    found = follow(start, rows, *where, shifts=Shifts(shift, nothing))
+    moved = T.expand(10, 4, 4).clone()
+    moved[:, :3, 3] -= (T[:3, :3] @ shift[..., None])[..., 0]
+    expected = follow(start, rows, moved, coefficient, count)
+    torch.testing.assert_close(found.t, expected.t)
+    torch.testing.assert_close(found.normal_px, expected.normal_px)
 
 
 def test_points_beyond_the_end_or_behind_the_camera_are_not_valid(lanes: Lanes):

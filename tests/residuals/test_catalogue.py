@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -27,6 +28,7 @@ CATALOGUE: dict[Callable[..., Tensor], tuple[str, ...]] = {
     reprojection.sign_view: ("pose", "size"),
     reprojection.drifting_sign_view: ("pose", "size", "drift", "drift"),
     lane.lane_reprojection: ("pose", *SPLINE),
+    lane.lane_reprojection_by_car: ("pose", *SPLINE, "optics"),
     lane.lane_height: ("pose", *SPLINE),
     lane.lane_prior: ("point",),
     lane.lane_stretch: ("point", "point"),
@@ -51,6 +53,7 @@ KINDS = {
     "drift": Variable(8, euclidean),
     "error": Variable(6, euclidean),
     "wander": Variable(9, euclidean),
+    "optics": Variable(7, euclidean),
 }
 ROWS = 24
 CORNERS = 3
@@ -95,6 +98,8 @@ def drawn() -> dict[str, Tensor]:
     names["typical_size"] = names["usual"]
     wander = dict(state=noise(9), before=noise(9), after=noise(9), mean=noise(6))
     names |= {f"wandering_{name}": value for name, value in wander.items()}
+    names |= dict(optics=noise(7), left_m=noise(7, scale=0.1), by_optics=noise(7))
+    names["left_camera"] = torch.nn.functional.normalize(noise(3), dim=-1)
     names["wandering_keep"] = noise(9).sigmoid()
     return names | {f"c{i}": point + step for i, step in enumerate(steps)}
 
@@ -183,3 +188,23 @@ def test_deviations_of_many_poses_are_those_of_one(jacobian, angle):
     expected = se3.local(T, turned)[:, 3:]
     found, _ = jacobian(*(x.movedim(0, -1) for x in blocks))
     torch.testing.assert_close(found[3:].mT, expected, rtol=1e-11, atol=1e-14)
+
+
+def test_markers_seen_to_the_left_and_markers_that_lie_there_are_alike_wherever_the_camera_is():
+    term, values = term_of(lane.lane_reprojection_by_car)
+    names = drawn()
+    shift = torch.linspace(-0.5, 0.5, ROWS).double()
+    m = names["left_m"]
+    seen = shift[:, None] * m / m.square().sum(1, keepdim=True)
+    # What else the optics do to the image is not asked here.
+    term = replace(term, constants=(*term.constants[:-1], torch.zeros_like(m)))
+    for T in (names["T_world_camera"], se3.retract(names["T_world_camera"], names["drift"])):
+        here = {**values, "0_pose": T}
+        turned = T[:, :3, :3] @ names["left_camera"][..., None]
+        lies = {
+            f"{i}_point": here[f"{i}_point"] + turned[..., 0] * shift[:, None] for i in range(1, 5)
+        }
+        torch.testing.assert_close(
+            residuals(term, {**here, **lies}),
+            residuals(term, {**here, "5_optics": here["5_optics"] + seen}),
+        )
