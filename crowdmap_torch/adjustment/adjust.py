@@ -23,7 +23,12 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.convoys import Convoys
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.cuts import cut_drives
-from crowdmap_torch.adjustment.lane_matching import LaneMatches, nearest_lanes, supported_lanes
+from crowdmap_torch.adjustment.lane_matching import (
+    LaneMatches,
+    follow,
+    nearest_lanes,
+    supported_lanes,
+)
 from crowdmap_torch.adjustment.lenses import lenses_of
 from crowdmap_torch.adjustment.observations import (
     CornerObservations,
@@ -53,6 +58,8 @@ from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Sig
 
 _SUPPORT_M = 3.0
 """How far along a lane tracklet a sample of it, which tells its lane, may be away: samples are 2 m apart."""
+_MARGIN = 1.3
+"""Lane points that meet the road further ahead than they are to be used, by this factor, lie on markers that far ahead."""
 _OWN_GATE_M = 1.0
 """How much further than others a lane point may at first be from the lane that clustering found it to be of [m]."""
 
@@ -91,6 +98,9 @@ def build(
     if lane_support is not None:
         known = supported_lanes(ground, points, lane_tracklets, lane_support, reach=_SUPPORT_M)
     points, matches = _matched(points, ground, lanes, known, config)
+    lane = spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count)
+    near = _in_reach(points, matches, start, lane, lanes.control_count, config)
+    points, matches = points[near], matches[near]
     observed = Observations(corners, points, matches, lenses_of(journeys)[0])
     every = torch.arange(len(given), device=given.device)
     if trusted is not None:
@@ -100,7 +110,6 @@ def build(
     frame = torch.nonzero(kept)[:, 0]
     nodes = _nodes(journeys, frame, config)
     at_nodes = drift[frame][nodes.first]
-    lane = spline_basis.to_coefficients_flat(lanes.control.point_world, lanes.control_count)
     place, unknowns = given[frame][nodes.first][:, :2, 3], 8 * len(signs) + lane.numel()
     cut = cut_drives(place, nodes.journey, unknowns, config.cut_unknowns, at_cut=MOST_NUMBERS)
     poses = pose_prior(
@@ -241,7 +250,7 @@ def _points_on_ground(
     T_world_camera: Float[Tensor, "f 4 4"],
     config: AdjustConfig,
 ) -> tuple[LanePointObservations, Float[Tensor, "m 3"]]:
-    """Lane points that meet the road near enough, and where in the world they do."""
+    """Lane points that may be near enough, by where they meet the road, and where in the world they do."""
     points = lane_point_observations(
         journeys,
         roads,
@@ -252,9 +261,30 @@ def _points_on_ground(
     ray = torch.nn.functional.pad(points.ideal, (0, 1), value=1.0)
     h = points.normal_camera * points.camera_height[:, None]
     distance = h.square().sum(-1) / (h * ray).sum(-1)
-    near = (distance > 0) & (distance < config.max_ground_distance_m)
+    near = (distance > 0) & (distance < _MARGIN * config.max_ground_distance_m)
     points, ray, h = points[near], ray[near], h[near]
     return points, plane.ground_points(ray, h, T_world_camera[points.frame])
+
+
+def _in_reach(
+    points: LanePointObservations,
+    matches: LaneMatches,
+    T_world_camera: Float[Tensor, "f 4 4"],
+    coefficient: Float[Tensor, "c 3"],
+    count: Int[Tensor, " n"],
+    config: AdjustConfig,
+) -> Bool[Tensor, " m"]:
+    """Which points show splines no further ahead than they are to be used.
+
+    By where the nearest place of the spline is, not the point itself: of points at the border those would stay whose noise
+    is downwards, towards the car, and all markers would be drawn in there.
+    """
+    T = T_world_camera[points.frame]
+    found = follow(matches, points, T, coefficient, count)
+    rows, weight = found.windows(count)
+    point = (weight[..., None] * coefficient[rows]).sum(1)
+    ahead = (T[:, :3, 2] * (point - T[:, :3, 3])).sum(-1)
+    return ahead < config.max_ground_distance_m
 
 
 def _matched(

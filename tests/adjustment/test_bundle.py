@@ -10,6 +10,7 @@ import torch
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.lane_matching import follow
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.mapper import MapResult, build_bundle
 from crowdmap_torch.optim.linearize import residuals, term_costs
@@ -108,6 +109,28 @@ def test_the_papers_cost_weighs_every_corner_and_lane_point_by_itself_and_all_pi
     # Nothing else is judged, and what was found stays.
     equations = bundle.backend().assemble(bundle.problem(), values)
     assert not bundle.judge(equations) and not bundle.given_up.any()
+
+
+def test_whether_a_lane_point_is_too_far_ahead_does_not_depend_on_its_own_noise(
+    build: Callable[[], Bundle],
+):
+    bundle = build()
+    reach = bundle.config.max_ground_distance_m
+    rows, values = bundle.lane_points, {k: v.detach() for k, v in bundle.values().items()}
+    T = values["pose"][rows.frame]
+    found = follow(bundle.matches, rows, T, values["lane"], bundle.lane_count)
+    coefficient, weight = found.windows(bundle.lane_count)
+    point = (weight[..., None] * values["lane"][coefficient]).sum(1)
+    on_spline = (T[:, :3, 2] * (point - T[:, :3, 3])).sum(-1)
+    ray = torch.nn.functional.pad(rows.ideal, (0, 1), value=1.0)
+    measured = rows.camera_height / (rows.normal_camera * ray).sum(-1)
+    assert on_spline.max() < reach
+    # Near the border points lie beyond it as often as before it, wherever the spline is: nothing is cut off.
+    border = (on_spline > reach - 2) & (on_spline < reach - 0.5)
+    assert int(border.sum()) > 50
+    assert bool((measured[border] > reach).any())
+    missed = (measured - on_spline)[border]
+    assert abs(float(missed.median())) < 0.2
 
 
 def test_judging_asks_the_equations_that_were_solved_and_not_for_others(
