@@ -280,9 +280,7 @@ def _in_reach(
     is downwards, towards the car, and all markers would be drawn in there.
     """
     T = T_world_camera[points.frame]
-    found = follow(matches, points, T, coefficient, count)
-    rows, weight = found.windows(count)
-    point = (weight[..., None] * coefficient[rows]).sum(1)
+    point = follow(matches, points, T, coefficient, count).points(coefficient, count)
     ahead = (T[:, :3, 2] * (point - T[:, :3, 3])).sum(-1)
     return ahead < config.max_ground_distance_m
 

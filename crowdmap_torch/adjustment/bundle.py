@@ -126,11 +126,11 @@ class Bundle(BundleState):
         values, made_with = self.values(), self.scales()
         if len(self.lane_points):
             pose = values["pose"][self.lane_points.frame]
-            splines = values["lane"], self.lane_count
-            begun = self._match_begun
-            shifts = self.fleet.shifts(self.lane_points, self._by_optics[1], values)
-            how = {"shifts": shifts, "begun": begun}
-            found = follow(self.matches, self.lane_points, pose, *splines, **how)
+            found = follow(
+                *(self.matches, self.lane_points, pose, values["lane"], self.lane_count),
+                shifts=self.fleet.shifts(self.lane_points, self._by_optics[1], values),
+                begun=self._match_begun,
+            )
             self.match_t, self.match_normal = found.t, found.normal_px
             self.match_valid = found.valid
         self.relinearise()

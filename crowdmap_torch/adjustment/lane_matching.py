@@ -45,6 +45,13 @@ class LaneMatches(Rows):
         coefficient, weight, _ = spline_basis.window_flat(self.t.clamp_min(0), start, own)
         return coefficient, weight
 
+    def points(
+        self, coefficient: Float[Tensor, "c 3"], count: Int[Tensor, " n"]
+    ) -> Float[Tensor, "m 3"]:
+        """The points themselves."""
+        own, weight = self.windows(count)
+        return (weight[..., None] * coefficient[own]).sum(1)
+
 
 @dataclass(frozen=True)
 class Shifts(Rows):

@@ -57,8 +57,7 @@ def relinearised_at(
         rows = before.lane_points
         if not len(rows):
             return rows, before.by_lane_point
-        coefficient, weight = matches.windows(lane_count)
-        point = (weight[..., None] * values["lane"][coefficient]).sum(1)
+        point = matches.points(values["lane"], lane_count)
         seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
         rows = relinearised(rows, lenses, by_lens[1], seen)
         return rows, fleet.by_optics(rows, lenses, seen, values["pose"])

@@ -119,8 +119,7 @@ def test_whether_a_lane_point_is_too_far_ahead_does_not_depend_on_its_own_noise(
     rows, values = bundle.lane_points, {k: v.detach() for k, v in bundle.values().items()}
     T = values["pose"][rows.frame]
     found = follow(bundle.matches, rows, T, values["lane"], bundle.lane_count)
-    coefficient, weight = found.windows(bundle.lane_count)
-    point = (weight[..., None] * values["lane"][coefficient]).sum(1)
+    point = found.points(values["lane"], bundle.lane_count)
     on_spline = (T[:, :3, 2] * (point - T[:, :3, 3])).sum(-1)
     ray = torch.nn.functional.pad(rows.ideal, (0, 1), value=1.0)
     measured = rows.camera_height / (rows.normal_camera * ray).sum(-1)
