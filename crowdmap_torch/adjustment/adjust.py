@@ -130,7 +130,8 @@ def build(
     of_frame = nodes.journey[nodes.of_frame]
     fleet = fleet_of(journeys, frame, of_frame, unknown, known_cars or {})
     values |= fleet.start
-    fixed = _fixed_terms(values, signs, lanes, observed.corners, control, config)
+    up = _up_of_road(observed, values["pose"], lane, lanes.control_count)
+    fixed = _fixed_terms(values, signs, lanes, up, observed.corners, control, config)
     priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet)
     return Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
 
@@ -309,12 +310,13 @@ def _fixed_terms(
     values: dict[str, Tensor],
     signs: Signs,
     lanes: Lanes,
+    up: Float[Tensor, "c 3"],
     corners: CornerObservations,
     control: ControlSigns | None,
     config: AdjustConfig,
 ) -> dict[str, CostTerm]:
     """What is known of signs and lanes before anything is seen of them."""
-    fixed = _lane_prior(values["lane"], lanes, config)
+    fixed = _lane_prior(values["lane"], lanes, up, config)
     if len(corners):
         facing = against_the_drive(values["pose"][corners.frame], corners.sign, len(signs))
         # Signs that nobody sees stay as they are.
@@ -339,10 +341,28 @@ def _control_term(control: ControlSigns, signs: Signs) -> CostTerm:
     )
 
 
+def _up_of_road(
+    observed: Observations,
+    T_world_camera: Float[Tensor, "p 4 4"],
+    coefficient: Float[Tensor, "c 3"],
+    count: Int[Tensor, " n"],
+) -> Float[Tensor, "c 3"]:
+    """Up from the road at each lane coefficient, in the mean of all who saw it; upwards where nobody did."""
+    points = observed.lane_points
+    of_frame = T_world_camera[points.frame, :3, :3]
+    normal = -(of_frame @ points.normal_camera[..., None])[..., 0]
+    beside, weight = observed.matches.windows(count)
+    up = torch.zeros_like(coefficient)
+    up[:, 2] = 1e-6
+    for row, share in zip(beside.unbind(1), weight.unbind(1), strict=True):
+        up.index_add_(0, row, share.abs()[:, None] * normal)
+    return torch.nn.functional.normalize(up, dim=-1)
+
+
 def _lane_prior(
-    coefficient: Float[Tensor, "c 3"], lanes: Lanes, config: AdjustConfig
+    coefficient: Float[Tensor, "c 3"], lanes: Lanes, up: Float[Tensor, "c 3"], config: AdjustConfig
 ) -> dict[str, CostTerm]:
-    """What holds control points together where observations do not.
+    """What holds control points together where observations do not; `up` is so from the road at each.
 
     Not where they started: that would count the journeys' own positions twice.
     """
@@ -352,8 +372,6 @@ def _lane_prior(
     along = spline_basis.derivative_flat(
         lanes.control.point_world, lanes.control_count, rank.to(coefficient), spline
     )
-    up = torch.zeros_like(along)
-    up[:, 2] = 1
     forward = torch.nn.functional.normalize(along, dim=-1)
     left = torch.nn.functional.normalize(torch.linalg.cross(up, forward), dim=-1)
     axes = torch.stack((forward, left, torch.linalg.cross(forward, left)), dim=-1)

@@ -342,7 +342,7 @@ class Bundle(BundleState):
     def _slide_term(self) -> dict[str, CostTerm]:
         if not len(self.lane_points):
             return {}
-        values, along = self.values(), self.fixed["lane_prior"].constants[1][:, :, 0]
+        values, along = self.values(), self.lane_axes[:, :, 0]
         return slide_term(values["pose"], values["lane"], self.beside, along, self.config)
 
     def _lane_terms(self, sigma: float) -> dict[str, CostTerm]:

@@ -143,6 +143,13 @@ class BundleState(nn.Module):
         return convoys(nodes.journey, nodes.way, count, self.config.convoy_m)
 
     @property
+    def lane_axes(self) -> Float[Tensor, "c 3 3"]:
+        """Along every lane coefficient's marker, to its left along the road, and up from that; the columns."""
+        if "lane_prior" not in self.fixed:
+            return self.scale.new_zeros(0, 3, 3)
+        return self.fixed["lane_prior"].constants[1]
+
+    @property
     def begun_matches(self) -> LaneMatches:
         """Where each lane point's match began, which it keeps near."""
         return replace(self.matches, t=self._match_begun)
@@ -193,6 +200,7 @@ class BundleState(nn.Module):
             *(self.matches, self.lane_count, self.lenses),
             (self._corners_by_lens, self._lane_points_by_lens),
             self.fleet,
+            self.lane_axes[:, :, 1],
         )
         self.corners, self.lane_points = found.corners, found.lane_points
         self._by_optics = (found.by_corner, found.by_lane_point)

@@ -157,7 +157,7 @@ class ByOptics:
     height: Float[Tensor, "m _ k"]
     """Of a lane point's height over the road; nothing for corners."""
     left: Float[Tensor, "_ 3"]
-    """Along the camera's axes, to where a lane point is detected that is not on its marker; nothing for corners."""
+    """Along the world's axes, to where a lane point is detected that is not on its marker; nothing for corners."""
 
     @classmethod
     def none(cls, count: int, config: CalibrationConfig, like: Tensor, heights: int) -> ByOptics:
@@ -294,8 +294,12 @@ class Fleet:
         lenses: Sequence[Camera],
         point_camera: Float[Tensor, "m 3"],
         pose: Float[Tensor, "p 4 4"],
+        left_lane: Float[Tensor, "m 3"] | None = None,
     ) -> ByOptics:
-        """Derivatives by the optics of the rows' cars of where points `point_camera` are seen, and above the road."""
+        """Derivatives by the optics of the rows' cars of where points `point_camera` are seen, and above the road.
+
+        Lane points have `left_lane`, along the road and across their marker, to either side.
+        """
         config, at = self.config, columns("optics", self.config)
         by = point_camera.new_zeros(len(rows), 2, width("optics", config))
         error, by_point = pixel_error_jacobian(point_camera.mT, rows.matrix.permute(1, 2, 0))
@@ -317,12 +321,13 @@ class Fleet:
             by[..., at["box"]] = (seen - _means(seen, rows.detection))[..., None] * config.box
         if "corner_px" in at and of_corners:
             by[..., at["corner_px"]] = torch.eye(2).to(by) * config.corner_px
-        if isinstance(rows, CornerObservations):
+        if isinstance(rows, CornerObservations) or left_lane is None:
             return ByOptics(by, by[:, :0], point_camera[:0])
-        ahead = torch.zeros_like(point_camera)
-        ahead[:, 2] = 1
-        left = torch.linalg.cross(-rows.normal_camera, ahead)
-        left = torch.nn.functional.normalize(left, dim=-1)
+        # To the left of who drives there. Where the camera looks is not asked: what a frame's own noise turns, all frames
+        # together would take for a shift of their detectors.
+        right = pose[rows.frame, :3, 0]
+        to_right = (left_lane * right).sum(-1, keepdim=True) > 0
+        left = torch.where(to_right, -left_lane, left_lane)
         return ByOptics(by, self._by_height(rows, lenses, point_camera), left)
 
     def _by_height(

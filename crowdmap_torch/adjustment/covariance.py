@@ -145,7 +145,7 @@ def _lane_sigma(bundle: Bundle, lanes: Lanes, covariance: MapCovariance) -> Floa
     count = lanes.control_count
     spline, rank = spline_basis.rows(count)
     start = spline_basis.starts(count)
-    across = bundle.fixed["lane_prior"].constants[1][:, :, 1]
+    across = bundle.lane_axes[:, :, 1]
     row, weight, _ = spline_basis.window_flat(rank.to(across), start[spline], count[spline])
     by_coefficient = weight[:, :, None] * across[:, None]
     point = LinearFunctions(

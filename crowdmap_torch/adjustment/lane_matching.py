@@ -48,7 +48,7 @@ class LaneMatches(Rows):
     def points(
         self, coefficient: Float[Tensor, "c 3"], count: Int[Tensor, " n"]
     ) -> Float[Tensor, "m 3"]:
-        """The points themselves."""
+        """The points themselves; or what else is said of coefficients, between them."""
         own, weight = self.windows(count)
         return (weight[..., None] * coefficient[own]).sum(1)
 
@@ -57,8 +57,8 @@ class LaneMatches(Rows):
 class Shifts(Rows):
     """What lies between a spline point and where a true camera and its detector see it, beside what is stated of them."""
 
-    camera: Float[Tensor, "m 3"]
-    """Of the point, along the camera's axes [m]."""
+    world: Float[Tensor, "m 3"]
+    """Of the point, along the world's axes [m]."""
     px: Float[Tensor, "m 2"]
     """Of the pixel, where that point is seen."""
 
@@ -183,12 +183,11 @@ def _followed(
     start = spline_basis.starts(count)[matches.lane]
     own = count[matches.lane]
     t = matches.t
-    R = T_world_camera[:, :3, :3]
     position, shift_px = T_world_camera[:, :3, 3], torch.zeros_like(matches.normal_px)
     if shifts is not None:
-        position = position - (R @ shifts.camera[..., None])[..., 0]
+        position = position - shifts.world
         shift_px = shifts.px
-    M = observations.matrix @ R.mT
+    M = observations.matrix @ T_world_camera[:, :3, :3].mT
     last = (own - 1).to(t)
     # Half a knot beyond either end is far enough to see that the point is not on this spline.
     least, most = torch.full_like(t, -0.5), last + 0.5

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.calibration import ByOptics, Fleet
@@ -36,10 +36,11 @@ def relinearised_at(
     lenses: Sequence[Camera],
     by_lens: tuple[Sequence[Int[Tensor, " _"]], Sequence[Int[Tensor, " _"]]],
     fleet: Fleet,
+    left_lane: Float[Tensor, "c 3"],
 ) -> Relinearised:
     """Those with the unknowns, and the splines' matches, where they are; `by_lens` are the `rows_by_lens` of both kinds.
 
-    Without a point of a kind its derivatives stay.
+    `left_lane` is across each lane coefficient's marker, along the road. Without a point of a kind its derivatives stay.
     """
 
     def corners() -> tuple[CornerObservations, ByOptics]:
@@ -60,7 +61,8 @@ def relinearised_at(
         point = matches.points(values["lane"], lane_count)
         seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
         rows = relinearised(rows, lenses, by_lens[1], seen)
-        return rows, fleet.by_optics(rows, lenses, seen, values["pose"])
+        across = matches.points(left_lane, lane_count)
+        return rows, fleet.by_optics(rows, lenses, seen, values["pose"], across)
 
     of_corners, of_points = beside(corners, lane_points, device=values["pose"].device)
     return Relinearised(*of_corners, *of_points)

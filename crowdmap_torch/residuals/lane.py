@@ -48,18 +48,18 @@ def lane_reprojection_by_car(
     weights: Float[Tensor, "4 *#rows"],
     normal_px: Float[Tensor, "2 *#rows"],
     observation: Float[Tensor, "3 3 *#rows"],
-    left_camera: Float[Tensor, "3 *#rows"],
+    left_world: Float[Tensor, "3 *#rows"],
     left_m: Float[Tensor, "k *#rows"],
     by_optics: Float[Tensor, "k *#rows"],
 ) -> Float[Tensor, "1 *#rows"]:
     """`lane_reprojection` by a car whose camera and detector have the errors `optics`.
 
-    They make it see the spline point by `left_m . optics` metres to the left, along `left_camera`, and move what is seen by
+    They make it see the spline point by `left_m . optics` metres to the left, along `left_world`, and move what is seen by
     `by_optics . optics` pixels along the image normal. Markers that are detected to the left and markers that lie there
-    look the same: so do they here, wherever a step may take them.
+    look the same: so do they here, wherever a step may take them and whichever way a camera looks.
     """
-    point = into_camera(T_world_camera, _spline_point((c0, c1, c2, c3), weights))
-    seen = point + left_camera * (left_m * optics).sum(0)
+    spline = _spline_point((c0, c1, c2, c3), weights)
+    seen = into_camera(T_world_camera, spline + left_world * (left_m * optics).sum(0))
     return _along(normal_px, pixel_error(seen, observation)) + (by_optics * optics).sum(0)
 
 
@@ -147,17 +147,19 @@ def lane_reprojection_by_car_jacobian(
     weights: Float[Tensor, "4 m"],
     normal_px: Float[Tensor, "2 m"],
     observation: Float[Tensor, "3 3 m"],
-    left_camera: Float[Tensor, "3 m"],
+    left_world: Float[Tensor, "3 m"],
     left_m: Float[Tensor, "k m"],
     by_optics: Float[Tensor, "k m"],
 ) -> tuple[Float[Tensor, "1 m"], tuple[Jacobian, ...]]:
     """`lane_reprojection_by_car` and its Jacobians by camera pose, the four coefficients and the optics."""
-    point = into_camera(T_world_camera, _spline_point((c0, c1, c2, c3), weights))
-    seen = torch.addcmul(point, left_camera, (left_m * optics).sum(0))
+    spline = _spline_point((c0, c1, c2, c3), weights)
+    shifted = torch.addcmul(spline, left_world, (left_m * optics).sum(0))
+    seen = into_camera(T_world_camera, shifted)
     error, by_camera = pixel_error_jacobian(seen, observation)
     by_camera = _along(normal_px, by_camera)
-    by_car = torch.addcmul(by_optics, left_m, (by_camera[0] * left_camera).sum(0))
-    by_slot = *_by_pose_and_spline(T_world_camera, point, by_camera, weights), by_car[None]
+    by_left = (by_camera[0] * components(T_world_camera[:3, :3], left_world)).sum(0)
+    by_car = torch.addcmul(by_optics, left_m, by_left)
+    by_slot = *_by_pose_and_spline(T_world_camera, seen, by_camera, weights), by_car[None]
     return _along(normal_px, error) + (by_optics * optics).sum(0), by_slot
 
 

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import columns
 from crowdmap_torch.adjustment.lane_matching import follow
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.geometry import se3
 from crowdmap_torch.mapper import MapResult, build_bundle
 from crowdmap_torch.optim.linearize import residuals, term_costs
 from crowdmap_torch.tables import Dataset
+
+if TYPE_CHECKING:
+    from worlds.adjusted_street import Street
 
 
 @pytest.fixture(scope="module")
@@ -150,3 +156,40 @@ def test_judging_asks_the_equations_that_were_solved_and_not_for_others(
     assert int(bundle.judged) == 2 and solved[-1].done
     # The last detections that were given up are told apart from the map by a correction, where that is all it takes.
     assert solved[-1].linearizations == len(solved)
+
+
+def test_detectors_that_see_markers_aside_and_markers_that_lie_aside_are_alike(
+    build: Callable[[], Bundle],
+):
+    bundle = build()
+    bundle.refresh()
+    term, values = bundle.problem().terms["lane_reprojection"], bundle.values()
+    config = bundle.fleet.config
+    number = columns("optics", config)["lane_m"].start
+    seen = values["optics"].clone()
+    seen[:, number] += 0.1 / config.lane_m
+    # The street is straight, and all drive it one way: what is to the left of one is so of all.
+    left = bundle.lane_axes[:, :, 1]
+    left = left * -torch.sign(left @ values["pose"][0, :3, 0])[:, None]
+    lies = {**values, "lane": values["lane"] + 0.1 * left}
+    found = residuals(term, {**values, "optics": seen})
+    torch.testing.assert_close(found, residuals(term, lies), rtol=0, atol=1e-9)
+    assert (found - residuals(term, values)).abs().median() > 0.1
+
+
+def test_what_only_the_prior_holds_stays_where_that_has_it(tiny_result: MapResult):
+    # All drive one way: nothing tells where detectors see markers, beside what they differ in from car to car.
+    cars = tiny_result.uncertainty.calibration.values()
+    shift = torch.tensor([car.estimate["lane_m"][0] for car in cars])
+    sigma = min(car.sigma["lane_m"][0] for car in cars)
+    assert float(shift.mean().abs()) < 0.1 * sigma
+
+
+def test_across_a_marker_is_along_the_road(street: Street):
+    lean = 0.01
+    turn = se3.so3_exp(torch.tensor([0.0, 0.0, lean], dtype=torch.float64))
+    leaning = [replace(road, normal_camera=road.normal_camera @ turn.mT) for road in street.roads]
+    as_it_is, banked = street.bundle(), replace(street, roads=tuple(leaning)).bundle()
+    before, after = (bundle.lane_axes[:, 2, 1].asin() for bundle in (as_it_is, banked))
+    expected = torch.full_like(after, lean)
+    torch.testing.assert_close((after - before).abs(), expected, atol=5e-4, rtol=0)
