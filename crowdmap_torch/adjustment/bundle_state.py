@@ -16,7 +16,6 @@ from crowdmap_torch.adjustment.calibration_priors import CalibrationScales
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.cuts import convoys
 from crowdmap_torch.adjustment.lane_matching import LaneMatches
-from crowdmap_torch.adjustment.lenses import rows_by_lens
 from crowdmap_torch.adjustment.parts import VARIABLES, Observations, Priors, SharedOut, Unknowns
 from crowdmap_torch.adjustment.relinearisation import Relinearised, relinearised_at
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections, KeptDetections
@@ -113,8 +112,6 @@ class BundleState(nn.Module):
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         self.corners, self.lane_points = corners, observations.lane_points
         self.lenses = observations.lenses
-        self._corners_by_lens = rows_by_lens(self.corners, self.lenses)
-        self._lane_points_by_lens = rows_by_lens(self.lane_points, self.lenses)
         self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
         # Where each lane point was followed to is part of the state: matching starts from there.
         matches = observations.matches
@@ -198,7 +195,6 @@ class BundleState(nn.Module):
             values,
             Relinearised(self.corners, by_corner, self.lane_points, by_point),
             *(self.matches, self.lane_count, self.lenses),
-            (self._corners_by_lens, self._lane_points_by_lens),
             self.fleet,
             self.lane_axes[:, :, 1],
         )

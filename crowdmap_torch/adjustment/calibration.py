@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -165,6 +165,12 @@ class ByOptics:
         k = width("optics", config)
         by = like.new_zeros(count, 2, k), like.new_zeros(count, heights, k)
         return cls(*by, like.new_zeros(count * heights, 3))
+
+    @classmethod
+    def of(cls, parts: Sequence[ByOptics]) -> ByOptics:
+        """Those of the rows of all parts, in order."""
+        columns = ([getattr(part, f.name) for part in parts] for f in fields(cls))
+        return cls(*map(torch.cat, columns))
 
 
 @dataclass(frozen=True)

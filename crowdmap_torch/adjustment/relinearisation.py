@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -11,11 +11,14 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment.calibration import ByOptics, Fleet
 from crowdmap_torch.adjustment.lane_matching import LaneMatches
-from crowdmap_torch.adjustment.lenses import relinearised
+from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.camera import Camera
-from crowdmap_torch.processes.threads import beside
+from crowdmap_torch.processes.threads import in_order
+
+_AT_ONCE = 1 << 14
+"""Rows that are seen to at once."""
 
 
 @dataclass(frozen=True)
@@ -34,35 +37,59 @@ def relinearised_at(
     matches: LaneMatches,
     lane_count: Int[Tensor, " n"],
     lenses: Sequence[Camera],
-    by_lens: tuple[Sequence[Int[Tensor, " _"]], Sequence[Int[Tensor, " _"]]],
     fleet: Fleet,
     left_lane: Float[Tensor, "c 3"],
 ) -> Relinearised:
-    """Those with the unknowns, and the splines' matches, where they are; `by_lens` are the `rows_by_lens` of both kinds.
+    """Those with the unknowns, and the splines' matches, where they are.
 
     `left_lane` is across each lane coefficient's marker, along the road. Without a point of a kind its derivatives stay.
     """
+    T_camera_world = se3.inverse(values["pose"])
 
-    def corners() -> tuple[CornerObservations, ByOptics]:
-        rows = before.corners
-        if not len(rows):
-            return rows, before.by_corner
-        sign = values["sign"][rows.sign]
+    def corners(at: slice) -> tuple[Tensor, ByOptics]:
+        rows = before.corners[at]
         corner = torch.nn.functional.pad(rows.template * values["size"][rows.sign], (0, 1))
-        point = se3.transform(sign, corner)
-        seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
-        rows = relinearised(rows, lenses, by_lens[0], seen)
-        return rows, fleet.by_optics(rows, lenses, seen, values["pose"])
+        point = se3.transform(values["sign"][rows.sign], corner)
+        return seen(rows, point, None)
 
-    def lane_points() -> tuple[LanePointObservations, ByOptics]:
-        rows = before.lane_points
-        if not len(rows):
-            return rows, before.by_lane_point
-        point = matches.points(values["lane"], lane_count)
-        seen = se3.transform(se3.inverse(values["pose"])[rows.frame], point)
-        rows = relinearised(rows, lenses, by_lens[1], seen)
-        across = matches.points(left_lane, lane_count)
-        return rows, fleet.by_optics(rows, lenses, seen, values["pose"], across)
+    def lane_points(at: slice) -> tuple[Tensor, ByOptics]:
+        own = matches[at]
+        point, across = (own.points(x, lane_count) for x in (values["lane"], left_lane))
+        return seen(before.lane_points[at], point, across)
 
-    of_corners, of_points = beside(corners, lane_points, device=values["pose"].device)
-    return Relinearised(*of_corners, *of_points)
+    def seen(
+        rows: CornerObservations | LanePointObservations,
+        point_world: Float[Tensor, "m 3"],
+        across: Float[Tensor, "m 3"] | None,
+    ) -> tuple[Tensor, ByOptics]:
+        point = se3.transform(T_camera_world[rows.frame], point_world)
+        rows = relinearised(rows, lenses, rows_by_lens(rows, lenses), point)
+        return rows.matrix, fleet.by_optics(rows, lenses, point, values["pose"], across)
+
+    # At once they would take as much memory as all normal equations.
+    pieces = [(corners, at) for at in _pieces(before.corners.detection)]
+    first_point = len(pieces)
+    pieces += [(lane_points, at) for at in _pieces(before.lane_points.frame)]
+    device = values["pose"].device
+    found = list(in_order(lambda piece: piece[0](piece[1]), pieces, device, worth=1))
+    of_corners, of_points = found[:first_point], found[first_point:]
+    rows, by_corner = before.corners, before.by_corner
+    if of_corners:
+        rows = replace(rows, matrix=torch.cat([matrix for matrix, _ in of_corners]))
+        by_corner = ByOptics.of([by for _, by in of_corners])
+    points, by_point = before.lane_points, before.by_lane_point
+    if of_points:
+        points = replace(points, matrix=torch.cat([matrix for matrix, _ in of_points]))
+        by_point = ByOptics.of([by for _, by in of_points])
+    return Relinearised(rows, by_corner, points, by_point)
+
+
+def _pieces(label: Int[Tensor, " m"]) -> list[slice]:
+    """Some rows after the other, those of a label, which are adjacent, in one piece."""
+    if len(label) <= _AT_ONCE:
+        return [slice(0, len(label))] if len(label) else []
+    begins = torch.nonzero(label[1:] != label[:-1])[:, 0] + 1
+    wanted = torch.arange(_AT_ONCE, len(label), _AT_ONCE, device=label.device)
+    at = torch.searchsorted(begins, wanted)
+    cuts = begins[at[at < len(begins)]].unique().tolist()
+    return [slice(a, b) for a, b in zip([0, *cuts], [*cuts, len(label)], strict=True)]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 import torch
 
-from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment import adjust, relinearisation
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import columns
 from crowdmap_torch.adjustment.lane_matching import follow
@@ -175,6 +175,24 @@ def test_detectors_that_see_markers_aside_and_markers_that_lie_aside_are_alike(
     found = residuals(term, {**values, "optics": seen})
     torch.testing.assert_close(found, residuals(term, lies), rtol=0, atol=1e-9)
     assert (found - residuals(term, values)).abs().median() > 0.1
+
+
+def test_rows_are_relinearised_piece_by_piece_to_the_same_bits(
+    build: Callable[[], Bundle], monkeypatch: pytest.MonkeyPatch
+):
+    bundle = build()
+    bundle.refresh()
+    # Within a piece boxes need all corners of a detection: a bound that parts most of them if any is parted.
+    monkeypatch.setattr(relinearisation, "_AT_ONCE", 7)
+    whole, before = bundle.problem(), bundle.values()
+    bundle.relinearise()
+    parted = bundle.problem()
+    for name in ("sign_reprojection", "lane_reprojection", "lane_height"):
+        assert torch.equal(
+            residuals(parted.terms[name], before), residuals(whole.terms[name], before)
+        )
+        pairs = zip(parted.terms[name].constants, whole.terms[name].constants, strict=True)
+        assert all(torch.equal(found, expected) for found, expected in pairs)
 
 
 def test_what_only_the_prior_holds_stays_where_that_has_it(tiny_result: MapResult):
