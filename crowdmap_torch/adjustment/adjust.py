@@ -113,8 +113,7 @@ def build(
     place, unknowns = given[frame][nodes.first][:, :2, 3], 8 * len(signs) + lane.numel()
     cut = cut_drives(place, nodes.journey, unknowns, config.cut_unknowns, at_cut=MOST_NUMBERS)
     poses = pose_prior(
-        *(journeys, given[frame], nodes, config.drift_spacing_m, positioning, config.prior, cut),
-        error=at_nodes[:, :3],
+        *(journeys, given[frame], nodes, positioning, config.prior, cut), error=at_nodes[:, :3]
     )
     at_start = poses.with_wander(at_nodes)
     values = {

@@ -20,6 +20,8 @@ class DriftNodes:
     journey: Int[Tensor, " n"]
     way: Float[Tensor, " n"]
     """Distance travelled at the node [m]."""
+    apart: Float[Tensor, " p"]
+    """How far each pose of the bundle is from its node along the way [m]."""
 
     def mean(self, at_nodes: Float[Tensor, "n k"], journeys: int) -> Float[Tensor, "j k"]:
         """The mean over each journey's nodes; zero where it has none."""
@@ -37,7 +39,7 @@ def drift_nodes(journey: Int[Tensor, " n"], way: Float[Tensor, " n"], spacing: f
     first = torch.nonzero(begins)[:, 0]
     count = torch.bincount(of_frame, minlength=len(first))
     centre = way.new_zeros(len(first)).index_add_(0, of_frame, way) / count
-    return DriftNodes(of_frame, first, journey[first], centre)
+    return DriftNodes(of_frame, first, journey[first], centre, (way - centre[of_frame]).abs())
 
 
 def begins_of(journey: Int[Tensor, " n"]) -> Bool[Tensor, " n"]:

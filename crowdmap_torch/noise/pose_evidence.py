@@ -128,14 +128,15 @@ def white_scales(
     journey = prior.nodes.journey[prior.nodes.of_frame]
     within = prior.within_stretch(scale)
     noise = prior.white_sigma * white_scale.repeat_interleave(3, dim=1)
-    present = noise.square() + within
-    share = (1 - left / present[journey]).clamp(0, 1)
+    present = noise.square()[journey] + within
+    share = (1 - left / present).clamp(0, 1)
 
     def summed(of_each: Float[Tensor, "p 6"]) -> Float[Tensor, "j 2"]:
         total = of_each.new_zeros(len(scale), 6).index_add_(0, journey, of_each)
         return total.view(-1, 2, 3).sum(-1)
 
     grown = (summed(residual.square()) + _WHITE_TRUST) / (summed(share) + _WHITE_TRUST)
-    found = grown * present.view(-1, 2, 3).mean(-1) - within.view(-1, 2, 3).mean(-1)
+    count = 3 * torch.bincount(journey, minlength=len(scale)).clamp_min(1)[:, None]
+    found = grown * summed(present) / count - summed(within) / count
     given = prior.white_sigma.view(2, 3).square().mean(-1)
     return (found / given).clamp_min(0).sqrt().clamp(*_WHITE_SCALES)

@@ -62,7 +62,6 @@ class PosePrior:
     pose: Float[Tensor, "p 4 4"]
     """The positioning module's poses."""
     nodes: DriftNodes
-    spacing_m: float
     bias_sigma: Float[Tensor, "j 6"]
     """As given, by journey: position, then rotation about the camera's axes."""
     drift_sigma: Float[Tensor, "j 6"]
@@ -99,7 +98,8 @@ class PosePrior:
 
         of_poses = slice(*frames)
         of_frame, starts = nodes.of_frame[of_poses] - a, nodes.first[a:b] - frames[0]
-        here = DriftNodes(of_frame, starts, nodes.journey[a:b], nodes.way[a:b])
+        apart = nodes.apart[of_poses]
+        here = DriftNodes(of_frame, starts, nodes.journey[a:b], nodes.way[a:b], apart)
         begins, follows, cut = own(self.begins), own(self.follows), own(self.cut)
         first_cut = self.first_cut + int((self.cut < a).sum())
         every = torch.arange(first, last, device=cut.device)
@@ -180,7 +180,7 @@ class PosePrior:
         bias, drift = self._scaled(scale)
         bias = bias[self.journeys]
         noise = self.white_sigma * white_scale.repeat_interleave(3, dim=1)
-        white = (noise.square() + self.within_stretch(scale)).sqrt()
+        white = (noise.square()[nodes.journey[nodes.of_frame]] + self.within_stretch(scale)).sqrt()
         journey = nodes.journey
         start, far, length = residuals.gauss_markov_start, drift, self.length_m
         way, moves = residuals.gauss_markov_step, residuals.gauss_markov_step_jacobian
@@ -221,20 +221,20 @@ class PosePrior:
                 residuals.pose_deviation,
                 self.slots["pose_white"],
                 (self.pose,),
-                1 / white[journey[nodes.of_frame]],
+                1 / white,
                 jacobian=residuals.pose_deviation_jacobian,
             ),
         }
 
-    def within_stretch(self, scale: Float[Tensor, "j _"]) -> Float[Tensor, "j 6"]:
-        """Variance of the drift within a stretch in which it is taken to stand still.
+    def within_stretch(self, scale: Float[Tensor, "j _"]) -> Float[Tensor, "p 6"]:
+        """Variance of the drift of every pose beside that of its stretch, in which it is taken to stand still.
 
-        It does move: by a random walk of a quarter of the stretch's length in the mean.
+        It does move: by a random walk from the stretch's middle.
         """
         walk = 2 * self._scaled(scale)[1].square() / self.length_m
         if self.wander is not None:
             walk[:, :3] += 2 * (self.wander.sigma * scale[:, 3:]).square() / self.wander.length_m
-        return walk * self.spacing_m / 4
+        return walk[self.nodes.journey[self.nodes.of_frame]] * self.nodes.apart[:, None]
 
     def rescaled(
         self, drift: Float[Tensor, "n k"], scale: Float[Tensor, "j s"], told: Float[Tensor, "j k"]
@@ -348,13 +348,12 @@ def pose_prior(
     journeys: Sequence[Journey],
     pose: Float[Tensor, "p 4 4"],
     nodes: DriftNodes,
-    spacing: float,
     positioning: PositioningNoise,
     config: PosePriorConfig,
     cut: Int[Tensor, " s"] | None = None,
     error: Float[Tensor, "n 3"] | None = None,
 ) -> PosePrior:
-    """The prior of the poses `pose` of a bundle, whose drift stands still within `spacing` metres.
+    """The prior of the poses `pose` of a bundle, whose drift stands still along the stretches of `nodes`.
 
     Drives are cut before the nodes `cut`, each of which another one of its journey is before. By a first estimate of the
     positions' `error` at nodes biases show whether they wander.
@@ -387,7 +386,7 @@ def pose_prior(
         bias = torch.cat((torch.where(wanders[:, None], left, bias[:, :3]), bias[:, 3:]), dim=1)
     chains = (begins, follows, cut, far)
     return PosePrior(
-        *(pose, nodes, spacing, bias, drift, length, white, *chains, config, slots), wander=wander
+        *(pose, nodes, bias, drift, length, white, *chains, config, slots), wander=wander
     )
 
 

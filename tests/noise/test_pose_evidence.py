@@ -61,7 +61,7 @@ def test_noise_from_frame_to_frame_is_found_whatever_it_was_taken_for(factor: fl
     prior = make_prior(3, way_m=400.0, spacing_m=0.25)
     poses, generator = len(prior.nodes.of_frame), torch.Generator().manual_seed(2)
     ones, scale = torch.ones(3, 3, dtype=F64), torch.ones(3, 2, dtype=F64)
-    within = prior.within_stretch(ones)[prior.nodes.journey[prior.nodes.of_frame]]
+    within = prior.within_stretch(ones)
     spread = ((factor * prior.white_sigma) ** 2 + within).sqrt()
     noise = spread * torch.randn(poses, 6, generator=generator, dtype=F64)
     # Of a few frames much is seen, of the others next to nothing.
@@ -90,6 +90,6 @@ def test_noise_from_frame_to_frame_is_found_whatever_it_was_taken_for(factor: fl
 def test_noise_that_nothing_tells_of_is_as_it_is_given():
     prior = make_prior(2)
     ones, scale = torch.ones(2, 3, dtype=F64), torch.ones(2, 2, dtype=F64)
-    sigma = (prior.white_sigma**2 + prior.within_stretch(ones))[prior.nodes.journey]
+    sigma = prior.white_sigma**2 + prior.within_stretch(ones)
     found = white_scales(prior, torch.zeros_like(sigma), sigma, ones, scale)
     torch.testing.assert_close(found, scale)

@@ -12,6 +12,7 @@ from worlds.pose_priors import GIVEN, make_prior
 from worlds.small_world import Builder
 
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.noise.drift_nodes import drift_nodes
 from crowdmap_torch.noise.pose_prior import PosePrior
 from crowdmap_torch.noise.stated_sigmas import stated_sigmas
 from crowdmap_torch.optim.linearize import linearize
@@ -29,7 +30,8 @@ def rescaled(prior: PosePrior, drift: Tensor, scale: Tensor) -> Tensor:
 def drawn_path(prior: PosePrior, scale: Tensor, generator: torch.Generator) -> Tensor:
     """Drift (node, journey, 6) whose sigmas are the given ones times `scale`."""
     bias, sigma = prior._scaled(scale)
-    keep = torch.exp(-prior.spacing_m / prior.length_m)
+    spacing = prior.nodes.way[1] - prior.nodes.way[0]
+    keep = torch.exp(-spacing / prior.length_m)
     count = len(prior.nodes.way) // len(scale)
     noise = torch.randn(count + 1, len(scale), 6, dtype=F64, generator=generator)
     drift = [sigma * noise[0]]
@@ -217,3 +219,16 @@ def test_sigmas_that_nobody_can_have_are_as_good_as_none(sigma: float):
     sound = replace(stated, sigma_position=torch.tensor([[0.01, 0.3, 2.0]] * 4))
     position, _ = stated_sigmas(sound)
     assert position is not None and position.tolist() == pytest.approx([0.01, 0.3, 2.0])
+
+
+def test_within_a_stretch_the_drift_moves_by_how_far_a_pose_is_from_its_middle():
+    prior = make_prior(2, way_m=40.0)
+    way = torch.tensor([0.0, 0.4, 0.8, 1.3, 2.6], dtype=F64)
+    nodes = drift_nodes(torch.zeros(5, dtype=torch.long), way, 1.0)
+    found = replace(prior, nodes=nodes).within_stretch(torch.tensor([[1.0, 2.0, 3.0]], dtype=F64))
+    # Poses that have a stretch to themselves are where their drift is.
+    apart = torch.tensor([0.4, 0.0, 0.4, 0.0, 0.0], dtype=F64)
+    torch.testing.assert_close(nodes.apart, apart)
+    grows = torch.tensor([2.0] * 3 + [3.0] * 3, dtype=F64) * prior.drift_sigma[0]
+    walk = 2 * grows.square() / prior.length_m[0]
+    torch.testing.assert_close(found, apart[:, None] * walk)

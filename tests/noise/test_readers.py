@@ -36,7 +36,7 @@ def prior(noise: PositioningNoise) -> torch.Tensor:
     journey = make_journey(RIG, straight_poses(5))
     way = torch.arange(5, dtype=F64)
     nodes = drift_nodes(torch.zeros(5, dtype=torch.long), way, 1.0)
-    made = pose_prior([journey], journey.T_world_camera, nodes, 1.0, noise, PosePriorConfig())
+    made = pose_prior([journey], journey.T_world_camera, nodes, noise, PosePriorConfig())
     return torch.stack(
         (made.bias_sigma[0], made.drift_sigma[0], made.length_m[0], made.white_sigma)
     )

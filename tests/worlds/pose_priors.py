@@ -30,7 +30,7 @@ def make_prior(
     way = (spacing_m * torch.arange(count)).to(F64).repeat(journeys)
     owner = torch.arange(journeys).repeat_interleave(count)
     every = torch.arange(len(way))
-    nodes = DriftNodes(every, every, owner, way)
+    nodes = DriftNodes(every, every, owner, way, torch.zeros_like(way))
     drive = Builder().drive("j", frames=3).journey
     drive = replace(
         drive,
@@ -39,5 +39,5 @@ def make_prior(
     )
     pose = torch.eye(4, dtype=F64).expand(len(way), 4, 4)
     return pose_prior(
-        [drive] * journeys, pose, nodes, spacing_m, PositioningNoise(), config or PosePriorConfig()
+        [drive] * journeys, pose, nodes, PositioningNoise(), config or PosePriorConfig()
     )
