@@ -40,6 +40,9 @@ from crowdmap_torch.residuals.lane import (
 from crowdmap_torch.residuals.reprojection import pixel_error_jacobian
 from crowdmap_torch.tables import Journey
 
+_ALONG = 0.5
+"""Least component, to the camera's right, of what is across a marker: one that is turned by more than 60 degrees from where
+the camera looks, such as a stop line, runs across the road, where detectors have no left."""
 _SUREST = 1e-3
 """Least share of the configuration's sigma that what was found before counts with."""
 
@@ -329,11 +332,10 @@ class Fleet:
             by[..., at["corner_px"]] = torch.eye(2).to(by) * config.corner_px
         if isinstance(rows, CornerObservations) or left_lane is None:
             return ByOptics(by, by[:, :0], point_camera[:0])
-        # To the left of who drives there. Where the camera looks is not asked: what a frame's own noise turns, all frames
-        # together would take for a shift of their detectors.
-        right = pose[rows.frame, :3, 0]
-        to_right = (left_lane * right).sum(-1, keepdim=True) > 0
-        left = torch.where(to_right, -left_lane, left_lane)
+        # To the left of who drives there. No more is asked of where the camera looks: what a frame's own noise turns, all
+        # frames together would take for a shift of their detectors.
+        to_right = (left_lane * pose[rows.frame, :3, 0]).sum(-1, keepdim=True)
+        left = torch.where(to_right.abs() > _ALONG, -to_right.sign() * left_lane, 0.0)
         return ByOptics(by, self._by_height(rows, lenses, point_camera), left)
 
     def _by_height(

@@ -203,6 +203,23 @@ def test_what_only_the_prior_holds_stays_where_that_has_it(tiny_result: MapResul
     assert float(shift.mean().abs()) < 0.1 * sigma
 
 
+def test_detectors_have_a_left_along_their_road_alone(build: Callable[[], Bundle]):
+    bundle = build()
+    bundle.refresh()
+    pose, rows = bundle.values()["pose"], bundle.lane_points
+    right, _, ahead = pose[rows.frame, :3, :3].unbind(2)
+    point = bundle.matches.points(bundle.values()["lane"], bundle.lane_count)
+    seen = se3.transform(se3.inverse(pose)[rows.frame], point)
+    for across, expected in (
+        (right, -right),
+        (-right, -right),
+        (0.8 * right + 0.6 * ahead, -0.8 * right - 0.6 * ahead),
+        (0.3 * right + 0.95 * ahead, torch.zeros_like(right)),
+    ):
+        found = bundle.fleet.by_optics(rows, bundle.lenses, seen, pose, across).left
+        torch.testing.assert_close(found, expected)
+
+
 def test_across_a_marker_is_along_the_road(street: Street):
     lean = 0.01
     turn = se3.so3_exp(torch.tensor([0.0, 0.0, lean], dtype=torch.float64))
