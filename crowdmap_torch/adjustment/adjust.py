@@ -126,8 +126,7 @@ def build(
         "lane": lane,
     }
     unknown = calibration or CalibrationConfig.off()
-    of_frame = nodes.journey[nodes.of_frame]
-    fleet = fleet_of(journeys, frame, of_frame, unknown, known_cars or {})
+    fleet = fleet_of(journeys, frame, nodes.journey_of_pose, unknown, known_cars or {})
     values |= fleet.start
     up = _up_of_road(observed, values["pose"], lane, lanes.control_count)
     fixed = _fixed_terms(values, signs, lanes, up, observed.corners, control, config)
@@ -361,7 +360,7 @@ def _up_of_road(
 def _lane_prior(
     coefficient: Float[Tensor, "c 3"], lanes: Lanes, up: Float[Tensor, "c 3"], config: AdjustConfig
 ) -> dict[str, CostTerm]:
-    """What holds control points together where observations do not; `up` is so from the road at each.
+    """What holds control points together where observations do not; `up` is away from the road at each.
 
     Not where they started: that would count the journeys' own positions twice.
     """

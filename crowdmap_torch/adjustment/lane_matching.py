@@ -46,8 +46,8 @@ class LaneMatches(Rows):
         return coefficient, weight
 
     def points(
-        self, coefficient: Float[Tensor, "c 3"], count: Int[Tensor, " n"]
-    ) -> Float[Tensor, "m 3"]:
+        self, coefficient: Float[Tensor, "c k"], count: Int[Tensor, " n"]
+    ) -> Float[Tensor, "m k"]:
         """The points themselves; or what else is said of coefficients, between them."""
         own, weight = self.windows(count)
         return (weight[..., None] * coefficient[own]).sum(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -19,6 +20,7 @@ from crowdmap_torch.processes.threads import in_order
 
 _AT_ONCE = 1 << 14
 """Rows that are seen to at once."""
+Observed = TypeVar("Observed", CornerObservations, LanePointObservations)
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ def relinearised_at(
     `left_lane` is across each lane coefficient's marker, along the road. Without a point of a kind its derivatives stay.
     """
     T_camera_world = se3.inverse(values["pose"])
+    of_coefficients = torch.cat((values["lane"], left_lane), dim=1)
 
     def corners(at: slice) -> tuple[Tensor, ByOptics]:
         rows = before.corners[at]
@@ -53,8 +56,7 @@ def relinearised_at(
         return seen(rows, point, None)
 
     def lane_points(at: slice) -> tuple[Tensor, ByOptics]:
-        own = matches[at]
-        point, across = (own.points(x, lane_count) for x in (values["lane"], left_lane))
+        point, across = matches[at].points(of_coefficients, lane_count).split(3, dim=1)
         return seen(before.lane_points[at], point, across)
 
     def seen(
@@ -72,16 +74,20 @@ def relinearised_at(
     pieces += [(lane_points, at) for at in _pieces(before.lane_points.frame)]
     device = values["pose"].device
     found = list(in_order(lambda piece: piece[0](piece[1]), pieces, device, worth=1))
-    of_corners, of_points = found[:first_point], found[first_point:]
-    rows, by_corner = before.corners, before.by_corner
-    if of_corners:
-        rows = replace(rows, matrix=torch.cat([matrix for matrix, _ in of_corners]))
-        by_corner = ByOptics.of([by for _, by in of_corners])
-    points, by_point = before.lane_points, before.by_lane_point
-    if of_points:
-        points = replace(points, matrix=torch.cat([matrix for matrix, _ in of_points]))
-        by_point = ByOptics.of([by for _, by in of_points])
-    return Relinearised(rows, by_corner, points, by_point)
+    return Relinearised(
+        *_joined(before.corners, before.by_corner, found[:first_point]),
+        *_joined(before.lane_points, before.by_lane_point, found[first_point:]),
+    )
+
+
+def _joined(
+    rows: Observed, by: ByOptics, pieces: Sequence[tuple[Tensor, ByOptics]]
+) -> tuple[Observed, ByOptics]:
+    """The rows with the matrices and derivatives of all pieces; as they are without any."""
+    if not pieces:
+        return rows, by
+    matrices, derivatives = zip(*pieces, strict=True)
+    return replace(rows, matrix=torch.cat(matrices)), ByOptics.of(derivatives)
 
 
 def _pieces(label: Int[Tensor, " m"]) -> list[slice]:

@@ -23,6 +23,11 @@ class DriftNodes:
     apart: Float[Tensor, " p"]
     """How far each pose of the bundle is from its node along the way [m]."""
 
+    @property
+    def journey_of_pose(self) -> Int[Tensor, " p"]:
+        """Journey of each pose of the bundle."""
+        return self.journey[self.of_frame]
+
     def mean(self, at_nodes: Float[Tensor, "n k"], journeys: int) -> Float[Tensor, "j k"]:
         """The mean over each journey's nodes; zero where it has none."""
         count = torch.bincount(self.journey, minlength=journeys).clamp_min(1)

@@ -125,7 +125,7 @@ def white_scales(
 
     `residual` is the poses' deviation from their drift, in units of their noise at the present scales.
     """
-    journey = prior.nodes.journey[prior.nodes.of_frame]
+    journey = prior.nodes.journey_of_pose
     within = prior.within_stretch(scale)
     noise = prior.white_sigma * white_scale.repeat_interleave(3, dim=1)
     present = noise.square()[journey] + within

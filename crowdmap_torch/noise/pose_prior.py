@@ -180,7 +180,7 @@ class PosePrior:
         bias, drift = self._scaled(scale)
         bias = bias[self.journeys]
         noise = self.white_sigma * white_scale.repeat_interleave(3, dim=1)
-        white = (noise.square()[nodes.journey[nodes.of_frame]] + self.within_stretch(scale)).sqrt()
+        white = (noise.square()[nodes.journey_of_pose] + self.within_stretch(scale)).sqrt()
         journey = nodes.journey
         start, far, length = residuals.gauss_markov_start, drift, self.length_m
         way, moves = residuals.gauss_markov_step, residuals.gauss_markov_step_jacobian
@@ -234,7 +234,7 @@ class PosePrior:
         walk = 2 * self._scaled(scale)[1].square() / self.length_m
         if self.wander is not None:
             walk[:, :3] += 2 * (self.wander.sigma * scale[:, 3:]).square() / self.wander.length_m
-        return walk[self.nodes.journey[self.nodes.of_frame]] * self.nodes.apart[:, None]
+        return walk[self.nodes.journey_of_pose] * self.nodes.apart[:, None]
 
     def rescaled(
         self, drift: Float[Tensor, "n k"], scale: Float[Tensor, "j s"], told: Float[Tensor, "j k"]

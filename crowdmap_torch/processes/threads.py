@@ -103,12 +103,6 @@ def in_order(
                 future.cancel()
 
 
-def beside(one: Callable[[], T], other: Callable[[], R], *, device: torch.device) -> tuple[T, R]:
-    """What two functions give, which have nothing to do with each other."""
-    first, second = in_order(lambda function: function(), (one, other), device, worth=1)
-    return first, second  # pyright: ignore[reportReturnType]
-
-
 @lru_cache(maxsize=1)
 def _libraries() -> ThreadpoolController:
     """The thread pools of the libraries that are loaded: found once, which takes milliseconds."""

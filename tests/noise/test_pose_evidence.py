@@ -68,7 +68,7 @@ def test_noise_from_frame_to_frame_is_found_whatever_it_was_taken_for(factor: fl
     of_frame = torch.full((poses, 1), 0.3, dtype=F64)
     if seen == "few":
         of_frame[torch.arange(poses) % 4 > 0] = 1e4
-    owner = prior.nodes.journey[prior.nodes.of_frame]
+    owner = prior.nodes.journey_of_pose
     for _ in range(60):
         sigma = (
             (scale.repeat_interleave(3, dim=1)[owner] * prior.white_sigma) ** 2 + within

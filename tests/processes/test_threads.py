@@ -10,7 +10,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from crowdmap_torch.processes.threads import beside, in_order, one_core_each, repeatable
+from crowdmap_torch.processes.threads import in_order, one_core_each, repeatable
 
 CPU = torch.device("cpu")
 
@@ -90,17 +90,18 @@ def test_pieces_within_pieces_are_not_waited_for_in_vain(threads: int):
     assert list(in_order(inner, items, CPU)) == [sum(range(i, i + 20)) for i in items]
 
 
-def test_two_functions_run_beside_each_other(threads: int):
+def test_two_that_are_worth_it_run_beside_each_other(threads: int):
     meet = threading.Barrier(2, timeout=20)
 
     def one() -> int:
         # Whoever waits alone is never let through.
         return meet.wait() if threads > 1 else 0
 
-    first, second = beside(one, lambda: f"{one()}", device=CPU)
+    both = (one, lambda: f"{one()}")
+    first, second = in_order(lambda function: function(), both, CPU, worth=1)
     assert isinstance(first, int) and isinstance(second, str)
 
 
 def test_an_error_of_the_second_of_two_reaches_who_asked(threads: int):
     with pytest.raises(ZeroDivisionError):
-        beside(lambda: 1, lambda: 1 // 0, device=CPU)
+        list(in_order(lambda i: 1 // i, (1, 0), CPU, worth=1))

@@ -25,12 +25,12 @@ def make_prior(
     way_m: float = WAY_M,
     spacing_m: float = SPACING_M,
 ) -> PosePrior:
-    """Journeys along one road, a node every few metres."""
+    """Journeys along one road, a node every few metres, and a pose as far from it as poses are in the mean."""
     count = int(way_m / spacing_m)
     way = (spacing_m * torch.arange(count)).to(F64).repeat(journeys)
     owner = torch.arange(journeys).repeat_interleave(count)
     every = torch.arange(len(way))
-    nodes = DriftNodes(every, every, owner, way, torch.zeros_like(way))
+    nodes = DriftNodes(every, every, owner, way, torch.full_like(way, spacing_m / 4))
     drive = Builder().drive("j", frames=3).journey
     drive = replace(
         drive,
