@@ -338,7 +338,7 @@ def adjusted_map(
     while True:
         bundle = build_bundle(journeys, maps, first, config, control=control)
         state = begun = adjust.start(bundle)
-        for iteration, after in adjust.steps(bundle, begun, engine=engine):
+        for iteration, after, _ in adjust.steps(bundle, begun, engine=engine):
             state = after
             progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
         again = made_anew(journeys, maps, first, bundle, config, engine)

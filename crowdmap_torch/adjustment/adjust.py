@@ -8,9 +8,10 @@ all that the next ones follow from; a bundle that is built alike goes on from th
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -39,6 +40,7 @@ from crowdmap_torch.adjustment.observations import (
     spaced_frames,
 )
 from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
+from crowdmap_torch.adjustment.residual_summary import TermSummary, residual_summary
 from crowdmap_torch.adjustment.steps import adjust_step, start
 from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.fleet.engine import Engine
@@ -170,18 +172,18 @@ def _nearest_poses(pose: Float[Tensor, "p 4 4"], point: Float[Tensor, "c 3"]) ->
 def adjust(bundle: Bundle) -> lm.LmState:
     """The state at the end of the adjustment; the bundle holds its values."""
     state = begun = start(bundle)
-    for _, after in steps(bundle, begun):
+    for _, after, _ in steps(bundle, begun):
         state = after
     return state
 
 
 def steps(
     bundle: Bundle, state: lm.LmState, *, first: int = 0, engine: Engine | None = None
-) -> Generator[tuple[int, lm.LmState], None, None]:
+) -> Generator[tuple[int, lm.LmState, Callable[[], dict[str, TermSummary]]], None, None]:
     """Every step's number, from `first` on, and the state after it, until the adjustment is finished or out of steps.
 
-    Many drives are shared out to the hosts of an engine, in `convoys`, which end with these steps; None: all are in this
-    process.
+    With each goes what tells the residuals there. Many drives are shared out to the hosts of an engine, in `convoys`, which
+    end with these steps; None: all are in this process. The lenses of a bundle that is shared out follow at the end.
     """
     numbers = range(first, bundle.config.lm.max_iterations)
     # What was read and matched has left room between what is kept.
@@ -189,6 +191,7 @@ def steps(
     with ExitStack() as ends:
         shared = len(bundle.convoys) > 1
         convoys = ends.enter_context(Convoys(bundle, state, engine)) if shared else None
+        seen = partial(residual_summary, bundle) if convoys is None else convoys.residuals
         for number in numbers:
             # What goes on with more to do was set running again: a state that is done was the last one.
             if number and state.done:
@@ -198,7 +201,9 @@ def steps(
                 give_back()
             else:
                 state, _ = convoys.step()
-            yield number, state
+            yield number, state, seen
+    if shared:
+        bundle.relinearise()
 
 
 @dataclass(frozen=True)

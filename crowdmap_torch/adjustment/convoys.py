@@ -23,6 +23,7 @@ from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import Fleet
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.parts import Observations, Priors, SharedOut, Unknowns
+from crowdmap_torch.adjustment.residual_summary import TermSummary, joined, residual_summary
 from crowdmap_torch.adjustment.steps import adjust_step
 from crowdmap_torch.fleet.company import Company, Program
 from crowdmap_torch.fleet.engine import Engine
@@ -174,6 +175,8 @@ def drive_along(member: Member) -> None:
             give_back()
             moved = bool(state.accepted.all())
             member.for_leader(list, _moved(bundle) if moved else ())
+        elif asked == "residuals":
+            member.for_leader(list, residual_summary(bundle))
         else:
             equations = _equations(bundle, *of)
             equations.share_covariance()
@@ -231,6 +234,13 @@ class Convoys(ExitStack):
         assert self.state is not None
         return self.state, finished
 
+    def residuals(self) -> dict[str, TermSummary]:
+        """`residual_summary` of the bundle."""
+        self._leader.tell(("residuals",))
+        found = self._leader.for_leader(joined, residual_summary(self._own))
+        assert found is not None, "of the leader"
+        return found
+
     def covariance(
         self, prior_scale: Float[Tensor, "j _"]
     ) -> tuple[MapCovariance, Float[Tensor, "j 4 4"]]:
@@ -240,7 +250,10 @@ class Convoys(ExitStack):
         return covariance, covariance.of_sums(*sums_of_bias(self._own))
 
     def _follow(self, moved: list[tuple[Tensor, ...]]) -> None:
-        """Has the bundle where the convoys are; `moved` is what each has of its own, nothing where no step was taken."""
+        """Has the bundle where the convoys are; `moved` is what each has of its own, nothing where no step was taken.
+
+        But for its lenses: a convoy that begins anew takes its own.
+        """
         assert self._state is not None and self.state is not None
         bundle, values = self.bundle, dict(self._state.values)
         values |= {name: self.state.values[name] for name in _OWN}
@@ -252,5 +265,4 @@ class Convoys(ExitStack):
             for name in kept.keys() - bundle.unknown_names - {*_OWN}:
                 getattr(bundle, name).copy_(kept[name])
             bundle.fold(values)
-            bundle.relinearise()
         self.state = replace(self._state, values=values, normal=None)

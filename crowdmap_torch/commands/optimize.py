@@ -272,8 +272,8 @@ def _adjusted(
     """The state when an adjustment is finished, every step watched and kept, and the engine of its convoys."""
     state, by, most = begun, where.of_convoys(bundle), bundle.config.lm.max_iterations
     taken = 0 if step is None else step.standing.steps
-    for iteration, state in adjust.steps(bundle, begun, first=taken, engine=by):
-        watch.step(len(watch.iterations), state, bundle)
+    for iteration, state, seen in adjust.steps(bundle, begun, first=taken, engine=by):
+        watch.step(len(watch.iterations), state, bundle, seen())
         kept.keep_step(adjust.standing(bundle, state, iteration + 1), watch.course, anew)
         progress("bundle adjustment", iteration + 1, most, f"cost {float(state.cost):.1f}")
     return state, by

@@ -13,10 +13,10 @@ from torch import Tensor
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import columns
+from crowdmap_torch.adjustment.residual_summary import TermSummary, residual_summary
 from crowdmap_torch.evaluation.evaluate import Against, progress_scalars
 from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.optim.linearize import residuals
-from crowdmap_torch.optim.robust import Loss
 from crowdmap_torch.report import plots
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.tensorboard import TensorBoardLog
@@ -76,7 +76,7 @@ class Watch:
         self._certain = signs.confidence >= self._least
         self._signs, self._lanes = signs, lanes
         if begins is not None:
-            self._cost = _cost(_squares(begins))
+            self._cost = _cost(residual_summary(begins))
 
     @torch.no_grad()
     def start(self, bundle: Bundle, map_before: HdMap) -> Residuals:
@@ -85,7 +85,7 @@ class Watch:
         self.residual_px["cluster heads"] = corner_residuals(bundle).norm(dim=-1)
         errors = self._errors(bundle, with_lanes=True)
         self._log.log_scalars(errors, 0)
-        self._cost = _cost(_squares(bundle))
+        self._cost = _cost(residual_summary(bundle))
         return Residuals(self.residual_px, self._cost)
 
     @property
@@ -100,11 +100,12 @@ class Watch:
         self._cost = self.iterations[-1].cost_after if self.iterations else residuals.cost
 
     @torch.no_grad()
-    def step(self, number: int, state: LmState, bundle: Bundle) -> None:
-        """One step of the solver."""
+    def step(
+        self, number: int, state: LmState, bundle: Bundle, summary: Mapping[str, TermSummary]
+    ) -> None:
+        """One step of the solver, and what it leaves of the residuals."""
         looked_at = number % self._every == 0
-        squares = _squares(bundle)
-        before, self._cost = self._cost, _cost(squares)
+        before, self._cost = self._cost, _cost(summary)
         iteration = Iteration(
             number=number + 1,
             cost={name: float(cost) for name, cost in state.term_cost.items()},
@@ -122,12 +123,10 @@ class Watch:
         if not looked_at:
             self._log.log_iteration(iteration)
             return
-        down_weighted = {}
-        for name, (squared, loss) in squares.items():
-            weight = loss.weight(squared)
-            down_weighted[name] = float((weight < 0.5).to(weight).mean()) if len(weight) else 0.0
-            self._log.log_histogram(f"residual/{name}", squared.sqrt(), number + 1)
-            self._log.log_histogram(f"weight/{name}", weight, number + 1)
+        for name, term in summary.items():
+            self._log.log_histogram(f"residual/{name}", term.squared.sqrt(), number + 1)
+            self._log.log_histogram(f"weight/{name}", term.weight, number + 1)
+        down_weighted = {name: term.down_weighted_share for name, term in summary.items()}
         self._log.log_iteration(iteration, down_weighted=down_weighted)
         scales = {f"scale/{name}": value for name, value in iteration.scale.items()}
         self._log.log_scalars(scales, number + 1)
@@ -162,22 +161,9 @@ class Watch:
         )
 
 
-_Squares = dict[str, tuple[Float[Tensor, " m"], Loss]]
-"""By term, every row's squared residual in units of its sigma, and what the rows lose by them."""
-
-
-def _squares(bundle: Bundle) -> _Squares:
-    """Where the bundle is and in its scales."""
-    problem, values = bundle.problem(), bundle.values()
-    return {
-        name: (residuals(term, values).square().sum(-1), term.loss)
-        for name, term in problem.terms.items()
-    }
-
-
-def _cost(squares: _Squares) -> float:
+def _cost(summary: Mapping[str, TermSummary]) -> float:
     """Of all terms."""
-    return sum(float(loss.rho(squared).sum() / 2) for squared, loss in squares.values())
+    return sum(term.cost for term in summary.values())
 
 
 def _scales(bundle: Bundle) -> dict[str, float]:

@@ -91,7 +91,7 @@ def _mapped(drives: Drives, maps: Sequence[JourneyMap], config: MapperConfig) ->
     with spent(stages, "adjustment"):
         bundle = build_bundle(journeys, maps, first, config)
         state = adjust.start(bundle)
-        for number_of_step, after in adjust.steps(bundle, state):
+        for number_of_step, after, _ in adjust.steps(bundle, state):
             state, taken = after, number_of_step + 1
     with spent(stages, "covariances"):
         result = finish_map(dataset, maps, first, bundle, state, config)

@@ -150,7 +150,7 @@ def test_judging_asks_the_equations_that_were_solved_and_not_for_others(
         return made[-1]
 
     monkeypatch.setattr(backend, "assemble", counted)
-    for step, state in adjust.steps(bundle, adjust.start(bundle)):
+    for step, state, _ in adjust.steps(bundle, adjust.start(bundle)):
         solved.append(state)
         assert len(made) == step + 1
     assert int(bundle.judged) == 2 and solved[-1].done

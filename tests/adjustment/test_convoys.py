@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment import residual_summary as summaries
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.convoys import Convoys, convoy
 from crowdmap_torch.adjustment.covariance import map_uncertainty
 from crowdmap_torch.adjustment.cuts import convoys
+from crowdmap_torch.adjustment.residual_summary import residual_summary
 from crowdmap_torch.fleet.beside import _Beside
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.company import Company
@@ -35,7 +37,7 @@ def adjusted(street, *, convoy_m: float, engine: Engine | None = None) -> dict[s
     """All that an adjustment has after some steps, and covariances there."""
     bundle = bundle_of(street, convoy_m=convoy_m)
     taken = adjust.steps(bundle, adjust.start(bundle), engine=engine)
-    costs = [float(state.cost) for _, (_, state) in zip(range(STEPS), taken, strict=False)]
+    costs = [float(state.cost) for _, (_, state, _) in zip(range(STEPS), taken, strict=False)]
     taken.close()
     found = map_uncertainty(bundle, street.signs, street.lanes, engine)
     own = {name: value for name, value in bundle.state_dict().items() if "delta" not in name}
@@ -104,12 +106,12 @@ def test_a_host_that_is_killed_at_the_end_of_a_step_begins_where_the_step_began(
 def test_an_adjustment_in_convoys_goes_on_where_it_was_interrupted(street, shared_out):
     whole, other = (bundle_of(street, convoy_m=50.0) for _ in range(2))
     taken = adjust.steps(whole, adjust.start(whole))
-    number, state = next(taken)
+    number, state, _ = next(taken)
     there = deepcopy(adjust.standing(whole, state, number + 1))
     taken.close()
     costs = [float(state.cost)]
     on = adjust.steps(other, adjust.go_on(other, there), first=there.steps)
-    costs += [float(state.cost) for _, (_, state) in zip(range(STEPS - 1), on, strict=False)]
+    costs += [float(state.cost) for _, (_, state, _) in zip(range(STEPS - 1), on, strict=False)]
     on.close()
     assert costs == shared_out["costs"].tolist()
     assert torch.equal(other.values()["sign"], shared_out["base_sign"])
@@ -126,6 +128,38 @@ def test_parts_of_a_bundle_cost_what_the_whole_costs(street):
     parts = [convoy(bundle, None, *of).bundle(ALONE) for of in bundle.convoys]
     assert sum(len(part.corners) for part in parts) == len(bundle.corners)
     assert sum(len(part.lane_points) for part in parts) == len(bundle.lane_points)
+
+
+def test_what_convoys_tell_of_residuals_is_that_of_the_whole(street):
+    bundle = bundle_of(street, convoy_m=50.0)
+    _, _, seen = next(taken := adjust.steps(bundle, adjust.start(bundle)))
+    found = seen()
+    taken.close()
+    bundle.relinearise()
+    expected = residual_summary(bundle)
+    assert {name for name, term in found.items() if term.rows} == {
+        name for name, term in expected.items() if term.rows
+    }
+    for name, term in expected.items():
+        assert (found[name].rows, found[name].down_weighted) == (term.rows, term.down_weighted)
+        assert found[name].cost == pytest.approx(term.cost, rel=1e-9)
+        shown, all_of_them = found[name].squared.sort().values, term.squared.sort().values
+        assert torch.allclose(shown, all_of_them, rtol=1e-6, atol=1e-9), name
+
+
+def test_a_summary_shows_some_of_many_rows(street, monkeypatch):
+    bundle = bundle_of(street, convoy_m=0.0)
+    adjust.start(bundle)
+    whole = residual_summary(bundle)["sign_reprojection"]
+    monkeypatch.setattr(summaries, "_MOST_ROWS", 100)
+    part = residual_summary(bundle)["sign_reprojection"]
+    assert (part.cost, part.rows, part.down_weighted) == (
+        *(whole.cost, len(whole.squared)),
+        int((whole.weight < 0.5).sum()),
+    )
+    every = -(-whole.rows // 100)
+    assert torch.equal(part.squared, whole.squared[::every])
+    assert torch.equal(part.weight, whole.weight[::every])
 
 
 def test_convoys_drive_about_as_much_each():

@@ -73,12 +73,12 @@ def test_an_adjustment_cut_at_any_step_goes_on_to_the_same_bits(
     state = begun = adjust.start(whole)
     write_stage(kept, adjust.standing(whole, begun, 0), key="")
     number = -1
-    for number, state in adjust.steps(whole, begun):
+    for number, state, _ in adjust.steps(whole, begun):
         # Each step is taken once more by a bundle that knows of the one before only what was kept.
         other = street.bundle(config=config)
         before = read_stage(kept, adjust.Standing, key="")
         again = adjust.go_on(other, before)
-        first, again = next(adjust.steps(other, again, first=before.steps))
+        first, again, _ = next(adjust.steps(other, again, first=before.steps))
         assert first == number and bool(again.accepted) == (number not in rejected)
         here, there = (
             adjust.standing(*one, number + 1) for one in ((whole, state), (other, again))

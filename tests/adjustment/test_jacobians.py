@@ -87,7 +87,7 @@ def test_the_gradient_is_that_of_the_exact_lens(build: Build) -> None:
     bundle = build("closed", CalibrationConfig.off())
     assert {lens.is_linear for lens in bundle.lenses} == {False, True}
     state = adjust.start(bundle)
-    for number, _ in adjust.steps(bundle, state):
+    for number, _, _ in adjust.steps(bundle, state):
         if number == 1:
             break
     term = bundle.problem().terms["sign_reprojection"]

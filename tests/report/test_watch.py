@@ -27,8 +27,8 @@ def watched(tiny: Dataset, tiny_result: MapResult, tiny_survey: Survey, tmp_path
     with TensorBoardLog(folder) as log:
         watch = Watch(log, against(tiny_survey), first.signs, first.lanes, every=2)
         watch.start(bundle, mapper.clusters_map(tiny, first))
-        for number, after in adjust.steps(bundle, state):
-            watch.step(number, after, bundle)
+        for number, after, seen in adjust.steps(bundle, state):
+            watch.step(number, after, bundle, seen())
             if number == 2:
                 break
         watch.finish(bundle, tiny_result.hd_map)

@@ -113,7 +113,7 @@ def adjusted_of(street: Street) -> Adjusted:
     bundle = street.bundle()
     state = begun = adjust.start(bundle)
     scales, costs = [bundle.scale.clone()], [float(state.cost)]
-    for _, state in adjust.steps(bundle, begun):
+    for _, state, _ in adjust.steps(bundle, begun):
         scales.append(bundle.scale.clone())
         costs.append(float(state.cost))
     return Adjusted(bundle, state.reasons[0], torch.stack(scales), costs)
