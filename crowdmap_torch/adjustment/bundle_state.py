@@ -11,17 +11,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from crowdmap_torch.adjustment.calibration import ByOptics
+from crowdmap_torch.adjustment.calibration import ByOptics, Fleet
 from crowdmap_torch.adjustment.calibration_priors import CalibrationScales
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.cuts import convoys
 from crowdmap_torch.adjustment.lane_matching import LaneMatches
+from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.adjustment.parts import VARIABLES, Observations, Priors, SharedOut, Unknowns
 from crowdmap_torch.adjustment.relinearisation import Relinearised, relinearised_at
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections, KeptDetections
 from crowdmap_torch.optim.problem import Variable, euclidean, pull_euclidean
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.journey_system import JourneyBackend
+from crowdmap_torch.processes.at_rest import rest
 from crowdmap_torch.processes.together import ALONE
 from crowdmap_torch.tables import to_device
 
@@ -120,10 +122,7 @@ class BundleState(nn.Module):
         self.register_buffer("match_normal", matches.normal_px.clone())
         self.register_buffer("match_valid", matches.valid.clone())
         self.register_buffer("refreshed", torch.zeros_like(self.judged, dtype=torch.bool))
-        self._by_optics = tuple(
-            ByOptics.none(len(rows), self.fleet.config, rows.px, heights)
-            for rows, heights in ((self.corners, 0), (self.lane_points, 1))
-        )
+        self._by_optics = _no_derivatives(self.fleet, self.corners, self.lane_points)
         self._by_mount = self.fleet.by_mount(values["pose"])
         self._detections = KeptDetections()
         self._backend: ChainBackend | JourneyBackend | None = None
@@ -201,6 +200,11 @@ class BundleState(nn.Module):
         self.corners, self.lane_points = found.corners, found.lane_points
         self._by_optics = (found.by_corner, found.by_lane_point)
 
+    def rest(self) -> None:
+        """Puts the observations, which others have, into a file, and forgets what follows from them until `relinearise`."""
+        self.corners, self.lane_points = rest((self.corners, self.lane_points))
+        self._by_optics = _no_derivatives(self.fleet, self.corners, self.lane_points)
+
     @property
     def calibration_scales(self) -> CalibrationScales:
         """How far cars are from the sigmas of `fleet`."""
@@ -216,3 +220,11 @@ class BundleState(nn.Module):
         corner = (self.scale[0].square() + self.lasting).sqrt()
         of_pixels = (self.scale[1:], corner[None], 1.0 + self.judged[None])
         return torch.cat((self.prior_scale.flatten(), self.white_scale.flatten(), *of_pixels))
+
+
+def _no_derivatives(
+    fleet: Fleet, corners: CornerObservations, points: LanePointObservations
+) -> tuple[ByOptics, ByOptics]:
+    """Those by optics of corners and lane points of which none are known."""
+    of_corners = ByOptics.none(len(corners), fleet.config, corners.px, 0)
+    return of_corners, ByOptics.none(len(points), fleet.config, points.px, 1)

@@ -216,7 +216,8 @@ class Convoys(ExitStack):
         self._leader = self._company.leader
         own = convoy(bundle, state, 0, 0)
         self._own, self._state = own.bundle(self._leader, bundle), own.state
-        # Convoys were copied to be handed over.
+        # Convoys were copied to be handed over, and have what follows from their observations.
+        bundle.rest()
         give_back()
 
     def _program(self, number: int) -> Program:

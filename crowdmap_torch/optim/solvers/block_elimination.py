@@ -147,9 +147,8 @@ def eliminate(
     wide = whitened.view(groups, size, w, k).transpose(1, 2).reshape(groups, w, size * k)
     scattered = None
     if batch.products is None:
-        at = pattern.at(batch.columns[:, :, None], batch.columns[:, None])
         product = (wide @ wide.mT).neg_()
-        scattered = at.flatten(), product.flatten()
+        scattered = pattern.squares(batch.columns).flatten(), product.flatten()
     return Eliminated(fill, wide, scattered)
 
 

@@ -122,7 +122,15 @@ class TilePattern:
 
         Row `dim` is the right-hand side, `dim + 1` forgotten.
         """
-        (down, r), (right, c) = self._tile(row), self._tile(column)
+        return self._place(*self._tile(row), *self._tile(column))
+
+    def squares(self, columns: Int[Tensor, "b w"]) -> Int[Tensor, "b w w"]:
+        """`at` of windows of columns, each with itself."""
+        tile, within = self._tile(columns)
+        return self._place(tile[:, :, None], within[:, :, None], tile[:, None], within[:, None])
+
+    def _place(self, down: Tensor, r: Tensor, right: Tensor, c: Tensor) -> Int[Tensor, ...]:
+        """Where in memory entries are, by tile and within it."""
         tile = down * len(self.base) + right
         begin = self.base.flatten().index_select(0, tile.flatten()).view(tile.shape)
         return begin.add_(r * self.width).add_(c)
