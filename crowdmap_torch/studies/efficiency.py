@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from statistics import fmean
 
 from crowdmap_torch.evaluation.signs import evaluate_signs
@@ -13,19 +14,22 @@ from crowdmap_torch.evaluation.visibility import observable_signs
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.simulate.dataset import SimulationConfig
-from crowdmap_torch.studies.chapter import Chapter, Table
+from crowdmap_torch.studies.chapter import Cell, Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, plot_lines
+from crowdmap_torch.studies.fleet import RIGHT, Variant
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.linear_map import linear_map
-from crowdmap_torch.studies.maps import honest_maps
+from crowdmap_torch.studies.maps import OURS, honest_maps
 from crowdmap_torch.studies.measure import load_drives
-from crowdmap_torch.studies.numbers import numbers
+from crowdmap_torch.studies.numbers import Result, numbers
 from crowdmap_torch.studies.scale import SHORT_TURNS, Scale
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import MeasureMap, Simulate, Task
 
 ASKED = {"relative": 1.2, "absolute": 1.1}
 """Most that our corner error may be, in multiples of the linear estimator's."""
+TREMBLES = (RIGHT, Variant("jitter"), Variant("jitter", 2.0))
+"""Detectors whose outlines stand still, tremble, and tremble twice as much."""
 
 
 @dataclass(frozen=True)
@@ -69,24 +73,20 @@ class MeasureLinear(Task):
 
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """Both estimates for each seed."""
-    for pair in _pairs(settings.scale):
+    scale = settings.scale
+    for pair in chain(_pairs(scale), *(_trembling(scale, variant) for variant in TREMBLES)):
         for task in pair:
             yield SHORT_TURNS + 2 * task.simulation.seed, task
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """Errors of both estimates on the same data, and the bound."""
-    done = [
-        (folder.read_result(ours.key), folder.read_result(linear.key))
-        for ours, linear in _pairs(settings.scale)
-        if ours.is_done(folder) and linear.is_done(folder)
-    ]
-    ours, linear = [a for a, _ in done], [b for _, b in done]
+    ours, linear = _done(_pairs(settings.scale), folder)
+    done = len(ours)
     rows, panels = [], []
-    seeds = list(range(len(done)))
+    seeds = list(range(done))
     for error, most in ASKED.items():
-        mine = numbers(ours, f"map.signs.{error}.total.mean")
-        best = numbers(linear, f"signs.{error}.total.mean")
+        mine, best = _means(ours, linear, error)
         if done:
             rows.append((error, fmean(mine), fmean(best), fmean(mine) / fmean(best), most))
         lines = [Line("ours", seeds, mine), Line("linear estimator", seeds, best)]
@@ -102,10 +102,13 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     scale = settings.scale
     return Chapter(
         text=(
-            f"{len(done)} data sets of {scale.honest_journeys} journeys on {scale.short_road.length_m:.0f} m of road. The "
+            f"{done} data sets of {scale.honest_journeys} journeys on {scale.short_road.length_m:.0f} m of road. The "
             "linear estimator is told what every detection shows, which ones are outliers, all noise levels and the "
             "process that the poses' errors are drawn from; it starts at the truth and is written in dense matrices. Its "
             "covariance is the Cramer-Rao bound.",
+            f"{scale.fleet_journeys} drives over {scale.fleet_road.length_m:.0f} m whose detectors tremble, all corners "
+            "of an outline alike and for some time (`study fleet`): the linear estimator weighs them by the covariance that "
+            "they are drawn from.",
         ),
         tables=(
             Table(
@@ -114,13 +117,62 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
                 tuple(rows),
             ),
             Table("efficiency-bound", ("Cramer-Rao bound", "1-sigma, three axes [m]"), bound),
+            Table(
+                "efficiency-tremble",
+                (
+                    *("trembles by [px]", "ours, relative [m]", "/ standing still"),
+                    *("linear estimator [m]", "/ standing still", "ours / linear", "seeds"),
+                ),
+                _tremble_rows(scale, folder),
+            ),
         ),
         plots={"efficiency": plot_lines(panels, x="seed", y="mean corner error [m]")},
     )
 
 
-def _pairs(scale: Scale) -> list[tuple[MeasureMap, MeasureLinear]]:
+_Pairs = list[tuple[MeasureMap, MeasureLinear]]
+
+
+def _pairs(scale: Scale) -> _Pairs:
     return [(m, MeasureLinear(m.simulation)) for m in honest_maps(scale, scale.linear_sets)]
+
+
+def _trembling(scale: Scale, variant: Variant) -> _Pairs:
+    """A few drives with these detectors, seed by seed."""
+    drives = [variant.spoil(scale.fleet_drives(seed)) for seed in range(scale.fleet_seeds)]
+    count = scale.fleet_journeys
+    return [(MeasureMap(each, count, config=OURS), MeasureLinear(each)) for each in drives]
+
+
+def _done(pairs: _Pairs, folder: StudyFolder) -> tuple[list[Result], list[Result]]:
+    """Results of both, of those that are done."""
+    done = [
+        (folder.read_result(ours.key), folder.read_result(linear.key))
+        for ours, linear in pairs
+        if ours.is_done(folder) and linear.is_done(folder)
+    ]
+    return [a for a, _ in done], [b for _, b in done]
+
+
+def _means(ours: list[Result], linear: list[Result], error: str) -> tuple[list[float], list[float]]:
+    """Mean corner errors of both, map by map."""
+    mine = numbers(ours, f"map.signs.{error}.total.mean")
+    return mine, numbers(linear, f"signs.{error}.total.mean")
+
+
+def _tremble_rows(scale: Scale, folder: StudyFolder) -> tuple[tuple[Cell, ...], ...]:
+    found = []
+    for variant in TREMBLES:
+        pairs = _trembling(scale, variant)
+        mine, best = _means(*_done(pairs, folder), "relative")
+        if not mine:
+            # Without those that stand still there is nothing to compare with.
+            break
+        found.append((pairs[0][0].simulation.signs.jitter_px, fmean(mine), fmean(best), len(mine)))
+    return tuple(
+        (trembles, mine, mine / found[0][1], best, best / found[0][2], mine / best, seeds)
+        for trembles, mine, best, seeds in found
+    )
 
 
 STUDY = Study("efficiency", "How far from the best possible?", tasks, chapter)

@@ -1,8 +1,8 @@
 """The best that can be done, by plain dense algebra: least squares linearised at the truth, and its covariance.
 
-The estimator knows what each detection shows, which ones are outliers, and all noise levels; the poses' error is the
-exact Gaussian process of the simulation. Its covariance is the Cramer-Rao bound. Nothing here is shared with the solver
-but the residuals: one dense matrix per journey, so it is for roads of a few hundred metres.
+The estimator knows what each detection shows, which ones are outliers, and all noise levels; the poses' error and the
+tremble of detectors are the exact Gaussian processes of the simulation. Its covariance is the Cramer-Rao bound. Nothing here
+is shared with the solver but the residuals: one dense matrix per journey, so it is for roads of a few hundred metres.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.optim.robust import Quadratic
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.simulate.positioning import PositioningConfig
+from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
 from crowdmap_torch.tables import Association, ControlPoints, Lanes, RoadEstimate, Signs, Survey
 
 CONTROL_SPACING_M = 8.0
@@ -185,8 +186,15 @@ def _of_journey(
     pose = torch.nonzero(mine)[:, 0]
     frame = bundle.frame[pose] - first
     p = 6 * len(pose)
-    terms = _true_terms(bundle, simulation, pose)
-    whole, force = _normal_equations(bundle, terms, poses=len(pose), first_pose=int(pose[0]))
+    corner, lane = _true_terms(bundle, simulation, pose)
+    here = {"poses": len(pose), "first_pose": int(pose[0])}
+    if simulation.signs.jitter_px:
+        t_s = journey.journey.t_ns[frame].double() * 1e-9
+        whole, force = _normal_equations(bundle, [lane], **here)
+        own, push = _of_tracks(bundle, corner, t_s, simulation.signs, **here)
+        whole, force = whole + own, force + push
+    else:
+        whole, force = _normal_equations(bundle, [corner, lane], **here)
     A, B, C = whole[:p, :p], whole[:p, p:], whole[p:, p:]
     gx, gy = force[:p], force[p:]
     T = journey.T_world_camera
@@ -201,7 +209,7 @@ def _of_journey(
 
 def _true_terms(
     bundle: Bundle, simulation: SimulationConfig, pose: Int[Tensor, " f"]
-) -> Sequence[CostTerm]:
+) -> tuple[CostTerm, CostTerm]:
     """The journey's observations with their true sigmas, outliers left out."""
     terms = bundle.problem().terms
     low, high = int(pose[0]), int(pose[-1])
@@ -209,7 +217,8 @@ def _true_terms(
     def of_journey(term: CostTerm, weight: Tensor, kept: Tensor) -> CostTerm:
         at = term.slots[0][1]
         own = torch.nonzero(kept & (at >= low) & (at <= high))[:, 0]
-        return rows(replace(term, weight=weight, loss=Quadratic()), own)
+        # What detections err by together is known here, not estimated.
+        return rows(replace(term, weight=weight, loss=Quadratic(), shared=None), own)
 
     corner, lane = terms["sign_reprojection"], terms["lane_reprojection"]
     # By the size of the box, which noise hardly changes.
@@ -230,23 +239,66 @@ def _normal_equations(
     bundle: Bundle, terms: Sequence[CostTerm], *, poses: int, first_pose: int
 ) -> tuple[Float[Tensor, "c c"], Float[Tensor, " c"]]:
     """Hessian and gradient of some terms at the bundle's values: `poses` from the first one on, then the landmarks."""
-    values, kinds, columns = bundle.values(), dict(bundle.variables), _columns(bundle)
-    total = 6 * poses + columns["lane"] + values["lane"].numel()
+    total = 6 * poses + _columns(bundle)["lane"] + bundle.values()["lane"].numel()
     hessian, gradient = torch.zeros(total, total, dtype=torch.float64), torch.zeros(total).double()
     for term in terms:
-        linear = linearize(term, kinds, values)
-        at = []
-        for (name, index), block in zip(term.slots, linear.jacobians, strict=True):
-            k = block.shape[1]
-            start = (index - first_pose) * k
-            if name != "pose":
-                start = 6 * poses + columns[name] + index * k
-            at.append(start + torch.arange(k)[:, None])
-        column, J = torch.cat(at), torch.cat(linear.jacobians, dim=1)
-        pulled = sum_of_products(J, linear.residual[:, None])
+        column, J, residual = _linear(bundle, term, poses=poses, first_pose=first_pose)
+        pulled = sum_of_products(J, residual[:, None])
         gradient.index_add_(0, column.flatten(), pulled.flatten())
         place = column[:, None] * total + column
         hessian.view(-1).index_add_(0, place.flatten(), sum_of_products(J, J).flatten())
+    return hessian, gradient
+
+
+def _linear(
+    bundle: Bundle, term: CostTerm, *, poses: int, first_pose: int
+) -> tuple[Int[Tensor, "k m"], Float[Tensor, "d k m"], Float[Tensor, "d m"]]:
+    """A term's rows: the columns that each reads, its derivatives by them, and its residual."""
+    columns = _columns(bundle)
+    linear = linearize(term, dict(bundle.variables), bundle.values())
+    at = []
+    for (name, index), block in zip(term.slots, linear.jacobians, strict=True):
+        k = block.shape[1]
+        start = (index - first_pose) * k
+        if name != "pose":
+            start = 6 * poses + columns[name] + index * k
+        at.append(start + torch.arange(k)[:, None])
+    return torch.cat(at), torch.cat(linear.jacobians, dim=1), linear.residual
+
+
+def _of_tracks(
+    bundle: Bundle,
+    term: CostTerm,
+    t_s: Float[Tensor, " f"],
+    signs: SignDetectionConfig,
+    *,
+    poses: int,
+    first_pose: int,
+) -> tuple[Float[Tensor, "c c"], Float[Tensor, " c"]]:
+    """`_normal_equations` of the corners that one drive saw, sign by sign: boxes tremble, all corners of each alike.
+
+    `t_s` is when the drive's poses were.
+    """
+    column, J, residual = _linear(bundle, term, poses=poses, first_pose=first_pose)
+    sign, t = term.slots[1][1], t_s[term.slots[0][1] - first_pose]
+    assert isinstance(term.weight, Tensor)
+    total = 6 * poses + _columns(bundle)["lane"] + bundle.values()["lane"].numel()
+    hessian, gradient = torch.zeros(total, total, dtype=torch.float64), torch.zeros(total).double()
+    for number in sign.unique():
+        own = torch.nonzero(sign == number)[:, 0]
+        tremble = torch.exp(-(t[own, None] - t[own]).abs() / signs.jitter_s)
+        weight = term.weight[own]
+        covariance = (signs.jitter_px * weight[:, None]) * (signs.jitter_px * weight) * tremble
+        factor = torch.linalg.cholesky(covariance + torch.eye(len(own)).to(covariance))
+        used, place = column[:, own].unique(return_inverse=True)
+        rows_of = torch.arange(len(own)).expand(place.shape)
+        for of_axis, left in zip(J[:, :, own], residual[:, own], strict=True):
+            dense = of_axis.new_zeros(len(own), len(used) + 1)
+            dense[rows_of, place] = of_axis
+            dense[:, -1] = left
+            white = torch.linalg.solve_triangular(factor, dense, upper=False)
+            hessian[used[:, None], used] += white[:, :-1].mT @ white[:, :-1]
+            gradient[used] += white[:, :-1].mT @ white[:, -1]
     return hessian, gradient
 
 

@@ -16,8 +16,31 @@ def test_only_data_sets_with_both_estimates_are_compared(settings: Settings, fol
     signs = figures(0.1, 0.2)["signs"]
     bound = {"signs": signs, "own_sigma_m": 0.03, "shared_sigma_m": 0.1, "seconds": 1.0}
     folder.write_result(linear.key, bound)
-    table, bounds = efficiency.chapter(settings, folder).tables
+    table, bounds, trembles = efficiency.chapter(settings, folder).tables
+    assert not rows(trembles)
     relative = rows(table)[0]
     assert relative[1:3] == pytest.approx((0.12, 0.1))
     assert relative[3] == pytest.approx(1.2)
     assert [row[1] for row in rows(bounds)] == pytest.approx([0.03, 0.1])
+
+
+def test_detectors_that_tremble_are_held_against_those_that_stand_still(
+    settings: Settings, folder: StudyFolder
+):
+    first = len(efficiency._pairs(settings.scale))
+    tasks = work(efficiency, settings)[2 * first :]
+    steady, twice = tasks[:2], tasks[-2:]
+    linear = {"signs": figures(0.1, 0.2)["signs"]}
+    for at, pair in enumerate((steady, twice)):
+        folder.write_result(pair[0].key, measured(relative=0.12 + 0.06 * at))
+        folder.write_result(pair[1].key, linear)
+    *_, table = efficiency.chapter(settings, folder).tables
+    # What trembles less is not known yet.
+    (row,) = rows(table)
+    assert row == pytest.approx((0.0, 0.12, 1.0, 0.1, 1.0, 1.2, 1))
+    for task in tasks[2:-2]:
+        is_linear = task.key.endswith("linear")
+        folder.write_result(task.key, linear if is_linear else measured(relative=0.15))
+    *_, table = efficiency.chapter(settings, folder).tables
+    assert [row[0] for row in rows(table)] == pytest.approx([0.0, 0.7, 1.4])
+    assert [row[2] for row in rows(table)] == pytest.approx([1.0, 1.25, 1.5])

@@ -18,6 +18,7 @@ from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.mapper import build_map
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.simulate.positioning import PositioningConfig
+from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
 from crowdmap_torch.studies import linear_map as module
 from crowdmap_torch.studies.linear_map import LinearMap, linear_map
 from crowdmap_torch.tables import Dataset, Signs, Survey
@@ -96,3 +97,48 @@ def test_poses_err_by_bias_drift_and_noise():
     assert float(covariance[3, 3]) == pytest.approx(
         math.radians(config.drift_rot_deg) ** 2 + math.radians(config.white_rot_deg) ** 2
     )
+
+
+@pytest.fixture(scope="module")
+@torch.no_grad()
+def first_drive(tiny_truth: Truth, tiny_survey: Survey, true_signs: Signs):
+    """The bundle at the truth, and what the first drive's corners are there, with their times."""
+    truth = Truth(tiny_truth.journeys[:1])
+    shown = torch.cat([module._shown(t) for t in truth.journeys])
+    row = torch.unique(shown[shown >= 0])
+    bundle = module._bundle_at_truth(truth, tiny_survey, true_signs, row)
+    corner, _ = module._true_terms(bundle, SimulationConfig(), torch.arange(len(bundle.frame)))
+    t_s = truth.journeys[0].journey.t_ns[bundle.frame].double() * 1e-9
+    return bundle, corner, t_s, {"poses": len(bundle.frame), "first_pose": 0}
+
+
+@torch.no_grad()
+def test_boxes_that_tremble_are_weighed_by_what_they_have_in_common(first_drive):
+    bundle, corner, t_s, here = first_drive
+    config = SignDetectionConfig(jitter_px=0.7, jitter_s=0.3)
+    hessian, gradient = module._of_tracks(bundle, corner, t_s, config, **here)
+    # Plainly, of all rows at once: J^T C^-1 J, with C in units of pixels.
+    sign, pose = corner.slots[1][1], corner.slots[0][1]
+    sigma, t = 1 / corner.weight, t_s[pose]
+    apart = (t[:, None] - t[None, :]).abs()
+    tremble = 0.7**2 * torch.exp(-apart / 0.3) * (sign[:, None] == sign[None, :])
+    inverse = torch.linalg.inv(torch.diag(sigma**2) + tremble)
+    column, whitened, residual = module._linear(bundle, corner, **here)
+    expected, force = torch.zeros_like(hessian), torch.zeros_like(gradient)
+    for axis in range(2):
+        J = hessian.new_zeros(len(sign), len(hessian))
+        J[torch.arange(len(sign)).expand(column.shape), column] = whitened[axis] * sigma
+        expected += J.mT @ inverse @ J
+        force += J.mT @ inverse @ (residual[axis] * sigma)
+    assert torch.allclose(hessian, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+    assert torch.allclose(gradient, force, rtol=1e-9, atol=1e-9 * float(force.abs().max()))
+
+
+@torch.no_grad()
+def test_boxes_that_hardly_tremble_are_weighed_like_others(first_drive):
+    bundle, corner, t_s, here = first_drive
+    config = SignDetectionConfig(jitter_px=1e-6)
+    hessian, gradient = module._of_tracks(bundle, corner, t_s, config, **here)
+    expected, force = module._normal_equations(bundle, [corner], **here)
+    assert torch.allclose(hessian, expected, rtol=1e-6, atol=1e-9 * float(expected.abs().max()))
+    assert torch.allclose(gradient, force, rtol=1e-6, atol=1e-9 * float(force.abs().max()))
