@@ -200,7 +200,8 @@ def _of_journey(
     T = journey.T_world_camera
     way = (T[1:, :3, 3] - T[:-1, :3, 3]).norm(dim=1).cumsum(0)
     way = torch.cat((way.new_zeros(1), way))[frame]
-    prior = torch.linalg.inv(_pose_covariance(way, simulation.positioning))
+    axes = _pose_covariances(way, simulation.positioning)
+    prior = _joint([torch.linalg.inv(axis) for axis in axes])
     error = se3.local(journey.journey.T_world_camera, T)[frame].flatten()
     right = torch.cat((B, (gx + prior @ error)[:, None]), dim=1)
     solved = torch.cholesky_solve(right, torch.linalg.cholesky(A + prior))
@@ -302,8 +303,10 @@ def _of_tracks(
     return hessian, gradient
 
 
-def _pose_covariance(way: Float[Tensor, " f"], config: PositioningConfig) -> Float[Tensor, "p p"]:
-    """Covariance of the errors of poses as the simulation draws them, pose by pose."""
+def _pose_covariances(
+    way: Float[Tensor, " f"], config: PositioningConfig
+) -> list[Float[Tensor, "f f"]]:
+    """Covariances of the errors of poses as the simulation draws them, axis by axis: they err apart."""
     apart = (way[:, None] - way).abs()
     eye = torch.eye(len(way), dtype=way.dtype)
     drift = config.drift_m**2 * torch.exp(-apart / config.drift_length_m)
@@ -314,8 +317,13 @@ def _pose_covariance(way: Float[Tensor, " f"], config: PositioningConfig) -> Flo
     if config.bias_wander_m:
         wander = torch.exp(-apart / config.bias_wander_length_m)
         drift = drift + config.bias_wander_m**2 * wander
-    axes = [b**2 + drift + w**2 * eye for b, w in zip(bias, white, strict=True)] + [turn] * 3
-    joint = way.new_zeros(len(way), 6, len(way), 6)
+    return [b**2 + drift + w**2 * eye for b, w in zip(bias, white, strict=True)] + [turn] * 3
+
+
+def _joint(axes: Sequence[Float[Tensor, "f f"]]) -> Float[Tensor, "p p"]:
+    """What is between all numbers of poses, pose by pose, of what is between those of each axis."""
+    count = len(axes[0])
+    joint = axes[0].new_zeros(count, len(axes), count, len(axes))
     for k, axis in enumerate(axes):
         joint[:, k, :, k] = axis
-    return joint.reshape(6 * len(way), 6 * len(way))
+    return joint.reshape(count * len(axes), count * len(axes))

@@ -88,7 +88,7 @@ def test_a_sign_seen_once_or_never_spoils_nothing(
 def test_poses_err_by_bias_drift_and_noise():
     way = torch.tensor([0.0, 150.0], dtype=torch.float64)
     config = PositioningConfig()
-    covariance = module._pose_covariance(way, config)
+    covariance = module._joint(module._pose_covariances(way, config))
     total = config.bias_e_m**2 + config.drift_m**2 + config.white_e_m**2
     assert float(covariance[0, 0]) == pytest.approx(total)
     between = config.bias_e_m**2 + config.drift_m**2 / math.e
