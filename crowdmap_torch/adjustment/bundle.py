@@ -21,7 +21,7 @@ from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
 from crowdmap_torch.adjustment.shared_corner_errors import lasting_variance, shared_errors
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, pose_evidence, white_scales
-from crowdmap_torch.noise.pose_prior import CUT_TERMS
+from crowdmap_torch.noise.pose_prior import CUT_TERMS, WANDER_SCALE
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
 from crowdmap_torch.optim.problem import CostTerm, Problem
@@ -49,6 +49,8 @@ _SCALE_STAYS = 0.005
 """A scale of the prior that would change by less than this share stays as it is: the cost is to fall from step to step."""
 _SCALE_RESTS = 0.05
 """Scales of the prior of which none would change by more than this share are at rest: they are not known any better."""
+_WANDER_RESTS = 0.1
+"""Likewise of the wander of biases: where there is none it shrinks step by step, and what is side by side stays there."""
 _CALIBRATION_RESTS = 0.2
 """Likewise of calibrations, which rest on few numbers: a fifth of a prior's sigma moves a map by nothing that shows."""
 _TOLD_HOLDS = 0.02
@@ -152,7 +154,9 @@ class Bundle(BundleState):
             lambda drift: self.whole.prior.rescaled(drift, self.prior_scale, self.drift_told),
             values["drift"],
         )
-        at_rest &= self._follow("prior_scale", found, _SCALE_STAYS, _SCALE_RESTS)
+        rests = torch.full_like(found, _SCALE_RESTS)
+        rests[:, WANDER_SCALE:] = _WANDER_RESTS
+        at_rest &= self._follow("prior_scale", found, _SCALE_STAYS, rests)
         self.refreshed.fill_(True)
         return at_rest
 
@@ -183,7 +187,7 @@ class Bundle(BundleState):
         found = self._of_journeys(white_scales(self.prior, residual, evidence.left, *scales))
         return self._follow("white_scale", found, _WHITE_RESTS, _WHITE_RESTS)
 
-    def _follow(self, name: str, found: Tensor, stays: float, rests: float) -> bool:
+    def _follow(self, name: str, found: Tensor, stays: float, rests: float | Tensor) -> bool:
         """Puts scales where they are `found`, to the last digit that counts; returns whether they are at rest."""
         return not bool((self._move(name, found, stays) > rests).any())
 

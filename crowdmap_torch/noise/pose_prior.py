@@ -38,6 +38,8 @@ CUT_TERMS = ("pose_before_cut", "pose_behind_cut")
 """The terms by which states at cuts are bound to the nodes around them."""
 _SWEEPS = 60
 """Alternations between scales and what all journeys share."""
+WANDER_SCALE = 3
+"""Column of the scales that is of the bias's wander, where there is any: behind bias, drift and rotation."""
 MOST_NUMBERS = 9
 """Numbers of the drift at a node, at most."""
 
@@ -187,7 +189,7 @@ class PosePrior:
         if self.wander is not None:
             start = residuals.wandering_start
             way, moves = residuals.wandering_step, residuals.wandering_step_jacobian
-            far = torch.cat((drift, self.wander.sigma * scale[:, 3:]), dim=1)
+            far = torch.cat((drift, self.wander.sigma * scale[:, WANDER_SCALE:]), dim=1)
             length = torch.cat((length, self.wander.length_m + 0 * length[:, :3]), dim=1)
 
         def steps(name: str, first: Int[Tensor, " e"], share: float) -> CostTerm:
@@ -233,7 +235,9 @@ class PosePrior:
         """
         walk = 2 * self._scaled(scale)[1].square() / self.length_m
         if self.wander is not None:
-            walk[:, :3] += 2 * (self.wander.sigma * scale[:, 3:]).square() / self.wander.length_m
+            walk[:, :3] += (
+                2 * (self.wander.sigma * scale[:, WANDER_SCALE:]).square() / self.wander.length_m
+            )
         return walk[self.nodes.journey_of_pose] * self.nodes.apart[:, None]
 
     def rescaled(
