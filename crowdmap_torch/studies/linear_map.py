@@ -19,7 +19,7 @@ from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.evaluation.visibility import observable_signs
-from crowdmap_torch.geometry import camera, polygon, se3
+from crowdmap_torch.geometry import camera, polygon, se3, spline_basis
 from crowdmap_torch.io.truth import JourneyTruth, Truth
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.linearize import linearize, rows, sum_of_products
@@ -69,6 +69,7 @@ def linear_map(
     information, force = _normal_equations(
         bundle, list(bundle.fixed.values()), poses=0, first_pose=0
     )
+    information += _held_along(bundle)
     for number, journey in enumerate(truth.journeys):
         own, push = _of_journey(bundle, truth, number, journey, simulation)
         information += own
@@ -175,6 +176,22 @@ def _columns(bundle: Bundle) -> dict[str, int]:
     """First column of each kind of landmark."""
     n = len(bundle.values()["sign"])
     return {"sign": 0, "size": 6 * n, "lane": 8 * n}
+
+
+def _held_along(bundle: Bundle) -> Float[Tensor, "c c"]:
+    """Information that holds each marker along itself to the signs, to a metre: nothing else tells where it is along itself.
+
+    By hundreds of metres it would slide, and draw the map along by the little that holds it to its place.
+    """
+    count, n = bundle.lane_count, len(bundle.values()["sign"])
+    lane, _ = spline_basis.rows(count)
+    share = bundle.lane_axes[:, :, 0] / count[lane, None]
+    columns = _columns(bundle)["lane"] + torch.arange(share.numel()).view(share.shape)
+    tells = share.new_zeros(len(count), int(columns.max()) + 1 if len(lane) else 8 * n)
+    tells[lane[:, None], columns] = share
+    of_signs = -share.new_zeros(len(count), 3).index_add_(0, lane, share) / max(n, 1)
+    tells[:, : 6 * n].view(len(count), n, 6)[..., :3] = of_signs[:, None]
+    return tells.mT @ tells
 
 
 def _of_journey(

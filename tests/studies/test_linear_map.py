@@ -142,3 +142,19 @@ def test_boxes_that_hardly_tremble_are_weighed_like_others(first_drive):
     expected, force = module._normal_equations(bundle, [corner], **here)
     assert torch.allclose(hessian, expected, rtol=1e-6, atol=1e-9 * float(expected.abs().max()))
     assert torch.allclose(gradient, force, rtol=1e-6, atol=1e-9 * float(force.abs().max()))
+
+
+@torch.no_grad()
+def test_markers_are_held_along_themselves_and_the_map_nowhere(first_drive):
+    bundle, *_ = first_drive
+    signs, coefficients = len(bundle.values()["sign"]), len(bundle.values()["lane"])
+    held = module._held_along(bundle)
+    every = torch.zeros(len(held), 3, dtype=torch.float64)
+    every[: 6 * signs].view(signs, 6, 3)[:, :3] = torch.eye(3).double()
+    every[8 * signs :].view(coefficients, 3, 3)[:] = torch.eye(3).double()
+    assert (held @ every).abs().max() < 1e-12
+    # A marker that slides along itself by two metres is two sigmas away.
+    first = int(bundle.lane_count[0])
+    slid = torch.zeros(len(held), dtype=torch.float64)
+    slid[8 * signs :].view(coefficients, 3)[:first] = 2 * bundle.lane_axes[:first, :, 0]
+    assert float(slid @ held @ slid) == pytest.approx(4.0)
