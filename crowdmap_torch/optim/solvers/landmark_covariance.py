@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -11,6 +12,7 @@ from torch import Tensor
 from crowdmap_torch.optim.solvers.border import WeightedSums
 from crowdmap_torch.optim.solvers.layout import Layout, read_entries
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
+from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 
 SumsOfChains = Callable[[Tensor, Tensor, int], tuple[Tensor, WeightedSums] | None]
@@ -33,12 +35,17 @@ class LandmarkCovariance:
     ) -> None:
         """`sums` are the `weighted_sums` of the chains.
 
-        `is_current` says whether the factors are there still: others may come into their memory.
+        `is_current` says whether the factors are there still: others may come into their memory. What landmarks have by
+        themselves, asked for once before then, is known afterwards too.
         """
         self.where = where
         self._factor, self._sums, self._is_current = factor, sums, is_current
-        # Of its own: the next factors come where these are.
-        self._inverse = factor.selected_inverse()
+
+    @cached_property
+    def _inverse(self) -> TileMatrix:
+        """When it is first asked for: as large as the factors, and those of drives may be gone by then."""
+        self._check()
+        return self._factor.selected_inverse()
 
     def of(self, functions: LinearFunctions) -> Float[Tensor, "n m m"]:
         """Covariance of each row's functions of landmarks, which are bound to each other."""
