@@ -205,6 +205,10 @@ class BundleState(nn.Module):
         self.corners, self.lane_points = rest((self.corners, self.lane_points))
         self._by_optics = _no_derivatives(self.fleet, self.corners, self.lane_points)
 
+    def forget_factors(self) -> None:
+        """Lets the solver's memory go."""
+        self._backend = None
+
     @property
     def calibration_scales(self) -> CalibrationScales:
         """How far cars are from the sigmas of `fleet`."""

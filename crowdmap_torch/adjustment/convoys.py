@@ -218,7 +218,13 @@ class Convoys(ExitStack):
         self._own, self._state = own.bundle(self._leader, bundle), own.state
         # Convoys were copied to be handed over, and have what follows from their observations.
         bundle.rest()
+        self.callback(self._forget)
         give_back()
+
+    def _forget(self) -> None:
+        """Lets factors as large as the map go at the end: what refers to itself in a circle stays until somebody looks."""
+        self._own.forget_factors()
+        self._state = self._state and replace(self._state, normal=None)
 
     def _program(self, number: int) -> Program:
         return drive_along, alone(convoy(self.bundle, self.state, *self._parts[number]))
