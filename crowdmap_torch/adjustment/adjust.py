@@ -202,8 +202,6 @@ def steps(
             else:
                 state, _ = convoys.step()
             yield number, state, seen
-    if shared:
-        bundle.relinearise()
 
 
 @dataclass(frozen=True)

@@ -210,6 +210,8 @@ class Convoys(ExitStack):
         self.bundle, self.state = bundle, state
         self._parts = bundle.convoys
         engine = InProcess() if engine is None else engine
+        # Behind the company's end: its hosts are gone by then.
+        self.push(self._ended)
         self._company = self.enter_context(
             Company(engine, len(self._parts), self._program, "bundle adjustment")
         )
@@ -218,13 +220,17 @@ class Convoys(ExitStack):
         self._own, self._state = own.bundle(self._leader, bundle), own.state
         # Convoys were copied to be handed over, and have what follows from their observations.
         bundle.rest()
-        self.callback(self._forget)
         give_back()
 
-    def _forget(self) -> None:
-        """Lets factors as large as the map go at the end: what refers to itself in a circle stays until somebody looks."""
+    def _ended(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Has the lenses of the bundle follow, unless all ends in an error.
+
+        Factors as large as the map go at once: what refers to itself in a circle stays until somebody looks.
+        """
         self._own.forget_factors()
         self._state = self._state and replace(self._state, normal=None)
+        if kind is None or issubclass(kind, GeneratorExit):
+            self.bundle.relinearise()
 
     def _program(self, number: int) -> Program:
         return drive_along, alone(convoy(self.bundle, self.state, *self._parts[number]))
@@ -259,7 +265,7 @@ class Convoys(ExitStack):
     def _follow(self, moved: list[tuple[Tensor, ...]]) -> None:
         """Has the bundle where the convoys are; `moved` is what each has of its own, nothing where no step was taken.
 
-        But for its lenses: a convoy that begins anew takes its own.
+        But for its lenses, until the end: a convoy that begins anew takes its own.
         """
         assert self._state is not None and self.state is not None
         bundle, values = self.bundle, dict(self._state.values)

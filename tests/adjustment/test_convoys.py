@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
+import weakref
 from copy import deepcopy
 from dataclasses import replace
 
@@ -14,6 +16,7 @@ from torch import Tensor
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment import residual_summary as summaries
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.convoys import Convoys, convoy
 from crowdmap_torch.adjustment.covariance import map_uncertainty
@@ -23,6 +26,7 @@ from crowdmap_torch.fleet.beside import _Beside
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.company import Company
 from crowdmap_torch.fleet.engine import Engine
+from crowdmap_torch.optim.solvers.journey_system import JourneyBackend
 from crowdmap_torch.processes.together import ALONE
 from crowdmap_torch.processes.workers import Workers
 
@@ -135,7 +139,6 @@ def test_what_convoys_tell_of_residuals_is_that_of_the_whole(street):
     _, _, seen = next(taken := adjust.steps(bundle, adjust.start(bundle)))
     found = seen()
     taken.close()
-    bundle.relinearise()
     expected = residual_summary(bundle)
     assert {name for name, term in found.items() if term.rows} == {
         name for name, term in expected.items() if term.rows
@@ -145,6 +148,36 @@ def test_what_convoys_tell_of_residuals_is_that_of_the_whole(street):
         assert found[name].cost == pytest.approx(term.cost, rel=1e-9)
         shown, all_of_them = found[name].squared.sort().values, term.squared.sort().values
         assert torch.allclose(shown, all_of_them, rtol=1e-6, atol=1e-9), name
+
+
+def test_a_bundle_has_its_lenses_again_when_convoys_are_gone(street):
+    config = replace(AdjustConfig(), convoy_m=50.0, cut_unknowns=60)
+    bundle = street.bundle(config=config, calibration=CalibrationConfig())
+    taken = adjust.steps(bundle, adjust.start(bundle))
+    _, _, seen = next(taken)
+    expected = seen()
+    taken.close()
+    assert bundle.values()["optics"].abs().max() > 0
+    map_uncertainty(bundle, street.signs, street.lanes)
+    for name, term in residual_summary(bundle).items():
+        assert term.cost == pytest.approx(expected[name].cost, rel=1e-9), name
+
+
+def test_factors_go_with_their_convoys(street):
+    bundle = bundle_of(street, convoy_m=50.0)
+    state = adjust.start(bundle)
+    gc.disable()
+    try:
+        with Convoys(bundle, state) as shared:
+            shared.step()
+            backend = shared._own.backend()
+            assert isinstance(backend, JourneyBackend)
+            factors = weakref.ref(backend._summed)
+            del backend
+            assert factors() is not None
+        assert factors() is None
+    finally:
+        gc.enable()
 
 
 def test_a_summary_shows_some_of_many_rows(street, monkeypatch):

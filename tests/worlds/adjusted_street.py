@@ -11,6 +11,7 @@ from worlds.drives import signs_by_detection
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.io.maps import read_map
@@ -35,7 +36,12 @@ class Street:
     drifts: tuple[Tensor, ...]
 
     def bundle(
-        self, *, left_out: tuple[int, ...] = (), config: AdjustConfig | None = None
+        self,
+        *,
+        left_out: tuple[int, ...] = (),
+        config: AdjustConfig | None = None,
+        positioning: PositioningNoise | None = None,
+        calibration: CalibrationConfig | None = None,
     ) -> Bundle:
         return adjust.build(
             self.journeys,
@@ -44,12 +50,13 @@ class Street:
             self.lanes,
             self.associations,
             self.drifts,
-            PositioningNoise(),
+            positioning or PositioningNoise(),
             config or AdjustConfig(),
             trusted=[
                 torch.full_like(journey.t_ns, number not in left_out, dtype=torch.bool)
                 for number, journey in enumerate(self.journeys)
             ],
+            calibration=calibration,
         )
 
 
