@@ -205,13 +205,10 @@ def _of_journey(
     p = 6 * len(pose)
     corner, lane = _true_terms(bundle, simulation, pose)
     here = {"poses": len(pose), "first_pose": int(pose[0])}
-    if simulation.signs.jitter_px:
-        t_s = journey.journey.t_ns[frame].double() * 1e-9
-        whole, force = _normal_equations(bundle, [lane], **here)
-        own, push = _of_tracks(bundle, corner, t_s, simulation.signs, **here)
-        whole, force = whole + own, force + push
-    else:
-        whole, force = _normal_equations(bundle, [corner, lane], **here)
+    t_s = journey.journey.t_ns[frame].double() * 1e-9
+    whole, force = _normal_equations(bundle, [lane], **here)
+    own, push = _of_tracks(bundle, corner, t_s, simulation.signs, **here)
+    whole, force = whole + own, force + push
     A, B, C = whole[:p, :p], whole[:p, p:], whole[p:, p:]
     gx, gy = force[:p], force[p:]
     T = journey.T_world_camera

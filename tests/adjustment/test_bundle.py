@@ -16,6 +16,8 @@ from crowdmap_torch.adjustment.lane_matching import follow
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.mapper import MapResult, build_bundle
+from crowdmap_torch.noise.pose_prior import WANDER_SCALE, PosePrior
+from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.linearize import residuals, term_costs
 from crowdmap_torch.tables import Dataset
 
@@ -228,3 +230,21 @@ def test_across_a_marker_is_along_the_road(street: Street):
     before, after = (bundle.lane_axes[:, 2, 1].asin() for bundle in (as_it_is, banked))
     expected = torch.full_like(after, lean)
     torch.testing.assert_close((after - before).abs(), expected, atol=5e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("scale", "moves", "rests"),
+    [(1, 0.92, False), (WANDER_SCALE, 0.92, True), (WANDER_SCALE, 0.85, False)],
+)
+def test_the_wander_of_biases_rests_while_it_moves_a_little(
+    street: Street, monkeypatch: pytest.MonkeyPatch, scale: int, moves: float, rests: bool
+):
+    bundle = street.bundle(positioning=PositioningNoise(wander_length_m=60.0))
+    assert bundle.prior.wander is not None
+    monkeypatch.setattr(PosePrior, "rescaled", lambda *_: bundle.prior_scale.clone())
+    # Pixels narrow first.
+    assert any(bundle.refresh() for _ in range(10))
+    factor = torch.ones_like(bundle.prior_scale)
+    factor[0, scale] = moves
+    monkeypatch.setattr(PosePrior, "rescaled", lambda *_: factor * bundle.prior_scale)
+    assert bundle.refresh() == rests
