@@ -122,3 +122,24 @@ def test_factors_have_the_same_bits_on_any_number_of_cores():
         torch.set_num_threads(before)
     for one, other in zip(*found, strict=True):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_inverse_is_right_at_the_far_end_of_a_long_road(seed: int):
+    """Blocks that two others tell well, and nothing else: what rounding leaves must not grow along them."""
+    generator = torch.Generator().manual_seed(seed)
+    steps, width = 300, 4
+    A = 1e-2 * torch.eye((steps + 2) * width).double()
+    for step in range(steps):
+        rows = slice(step * width, (step + 3) * width)
+        bend = 10 * torch.randn(width, 3 * width, generator=generator, dtype=torch.float64)
+        bend += 100 * torch.tensor([[1.0, -2.0, 1.0]]).kron(torch.eye(width))
+        A[rows, rows] += bend.mT @ bend
+    tile = torch.arange(len(A) // width)
+    band = ((tile[:, None] - tile).abs() <= 2).numpy()
+    factor = TiledCholesky.of(by_tiles(A, band, width))
+    assert factor is not None
+    every = torch.arange(len(A))
+    found = factor.selected_inverse().read(every, every)
+    expected = factor.solve(torch.eye(len(A)).double()).diagonal()
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=0)
