@@ -17,7 +17,8 @@ from torch import Tensor
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
-from crowdmap_torch.adjustment.lane_matching import detection_lanes
+from crowdmap_torch.adjustment.footing import Footing, footing_of
+from crowdmap_torch.adjustment.lane_matching import with_lanes
 from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
 from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_lanes
@@ -114,6 +115,8 @@ class FirstMap:
     """Signs that went into others then."""
     before: FirstMap | None = None
     """That of the clusters, before any adjustment, where it was made anew."""
+    footing: Footing | None = None
+    """Where the adjustment of which it was made stood."""
 
 
 @dataclass(frozen=True)
@@ -316,6 +319,7 @@ def build_bundle(
         trusted=first.crowd.trusted_frames(journeys),
         calibration=config.calibration,
         known_cars=known_cars,
+        footing=first.footing,
         control=None
         if control is None
         else find_control_signs(first.signs, control, config.control),
@@ -341,9 +345,9 @@ def adjusted_map(
         for iteration, after, _ in adjust.steps(bundle, begun, engine=engine):
             state = after
             progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
-        again = made_anew(journeys, maps, first, bundle, config, engine)
+        again, known = made_anew(journeys, maps, first, bundle, config, engine)
         if again is None:
-            return finish_map(dataset, maps, first, bundle, state, config, engine)
+            return finish_map(dataset, maps, first, bundle, state, config, engine, known)
         first = again
 
 
@@ -356,14 +360,16 @@ def made_anew(
     bundle: Bundle,
     config: MapperConfig,
     engine: Engine | None = None,
-) -> FirstMap | None:
-    """What the adjustment begins again with: where it was, and without what turned out to be one; None: nothing did."""
+) -> tuple[FirstMap | None, MapUncertainty | None]:
+    """What the adjustment begins again with: where it was, and without what turned out to be one; None: nothing did.
+
+    With it the covariances, if they had to be known for that.
+    """
     rules = config.duplicate_signs
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
-    if first.completed is None or first.anew >= rules.rounds:
-        return None
-    if not len(may_be_one(signs, journeys, first.associations, rules)):
-        return None
+    is_last = first.completed is None or first.anew >= rules.rounds
+    if is_last or not len(may_be_one(signs, journeys, first.associations, rules)):
+        return None, None
     known = map_uncertainty(bundle, first.signs, first.lanes, engine)
     signs = replace(signs, covariance=known.center - known.shared)
     found = associated_once(
@@ -383,7 +389,8 @@ def made_anew(
         anew=first.anew + 1,
         joined=first.joined + len(signs) - len(found.heads),
         before=first.before or first,
-    )
+        footing=footing_of(bundle),
+    ), known
 
 
 @one_core_each()
@@ -396,30 +403,24 @@ def finish_map(
     state: LmState,
     config: MapperConfig,
     engine: Engine | None = None,
+    uncertainty: MapUncertainty | None = None,
 ) -> MapResult:
     """The adjusted map with its covariances, the refined poses, and which landmark each detection shows.
 
-    Covariances of many drives are found by the hosts of an engine; None: all in this process.
+    Covariances that are not known yet are found by the hosts of an engine, of many drives; None: all in this process.
     """
-    journeys = dataset.journeys
-    poses = adjust.read_poses(bundle, journeys)
-    uncertainty = map_uncertainty(bundle, first.signs, first.lanes, engine)
+    poses = adjust.read_poses(bundle, journeys := dataset.journeys)
+    uncertainty = uncertainty or map_uncertainty(bundle, first.signs, first.lanes, engine)
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes, uncertainty)
     associations = first.associations
     if first.completed is not None:
         # Once more with the adjusted poses: what the first projections were too far off for.
-        made = [m.sign_tracklets for m in maps]
-        again = complete_tracks(journeys, poses, made, signs, associations, config.complete_tracks)
-        associations = again.associations
-        trusted = first.crowd.journey_weight > 0
-        signs = with_evidence(signs, journeys, associations, trusted, config.complete_tracks)
-    associations = tuple(
-        replace(
-            association,
-            lane=detection_lanes(journey, m.road, pose, lanes, gate=config.adjust.lane_gate_m),
-        )
-        for journey, m, pose, association in zip(journeys, maps, poses, associations, strict=True)
-    )
+        rules, made = config.complete_tracks, [m.sign_tracklets for m in maps]
+        again = complete_tracks(journeys, poses, made, signs, associations, rules)
+        associations, trusted = again.associations, first.crowd.journey_weight > 0
+        signs = with_evidence(signs, journeys, associations, trusted, rules)
+    roads, gate = [m.road for m in maps], config.adjust.lane_gate_m
+    associations = with_lanes(associations, journeys, roads, poses, lanes, gate=gate)
     provenance = {"config": config_hash(config), "journeys": [j.journey_id for j in journeys]}
     if dataset.bbox is not None:
         provenance["bbox"] = [*dataset.bbox]

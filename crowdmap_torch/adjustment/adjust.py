@@ -24,6 +24,7 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.convoys import Convoys
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.cuts import cut_drives
+from crowdmap_torch.adjustment.footing import Footing, stand_on
 from crowdmap_torch.adjustment.lane_matching import (
     LaneMatches,
     follow,
@@ -82,6 +83,7 @@ def build(
     control: ControlSigns | None = None,
     calibration: CalibrationConfig | None = None,
     known_cars: Mapping[str, KnownCalibration] | None = None,
+    footing: Footing | None = None,
 ) -> Bundle:
     """The bundle of all journeys, started at cluster heads and at poses moved by the estimated `drifts` (V-B).
 
@@ -133,7 +135,10 @@ def build(
     up = _up_of_road(observed, values["pose"], lane, lanes.control_count)
     fixed = _fixed_terms(values, signs, lanes, up, observed.corners, control, config)
     priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet)
-    return Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
+    bundle = Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
+    if footing is not None:
+        stand_on(bundle, footing)
+    return bundle
 
 
 def _kept_frames(

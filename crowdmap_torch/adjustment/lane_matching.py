@@ -17,7 +17,15 @@ from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import plane, spline_basis
 from crowdmap_torch.processes.threads import in_order
 from crowdmap_torch.residuals.reprojection import MIN_DEPTH
-from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Rows, Tracklets, concatenate
+from crowdmap_torch.tables import (
+    Association,
+    Journey,
+    Lanes,
+    RoadEstimate,
+    Rows,
+    Tracklets,
+    concatenate,
+)
 
 _STEPS = 4
 """Gauss-Newton steps along the projected spline; it is nearly straight at a lane point's scale."""
@@ -225,6 +233,23 @@ def _projected(
     depth = y[:, 2:].clamp_min(MIN_DEPTH)
     error = y[:, :2] / depth
     return y, error, (dy[:, :2] - error * dy[:, 2:]) / depth
+
+
+def with_lanes(
+    associations: Sequence[Association],
+    journeys: Sequence[Journey],
+    roads: Sequence[RoadEstimate],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    lanes: Lanes,
+    *,
+    gate: float,
+) -> tuple[Association, ...]:
+    """The associations with the lane that each lane detection of the journeys shows, by their `detection_lanes`."""
+    drives = zip(associations, journeys, roads, poses, strict=True)
+    return tuple(
+        replace(association, lane=detection_lanes(journey, road, pose, lanes, gate=gate))
+        for association, journey, road, pose in drives
+    )
 
 
 def detection_lanes(

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import pyarrow as pa
@@ -18,6 +19,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from worlds.runs import ROUGH, Said, journeys_of
+from worlds.split_signs import with_a_split_sign
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
@@ -292,6 +294,29 @@ def test_a_part_of_the_dataset_is_mapped_gone_on_with_and_judged_as_a_whole_one(
         for kind in ("signs", "lanes")
     ]
     assert pq.read_metadata(out / "associations.parquet").num_rows == sum(rows)
+
+
+def test_a_run_whose_adjustment_began_again_goes_on_to_the_same_bits(
+    optimize, cuts: Cuts, monkeypatch: pytest.MonkeyPatch, small: Path, tmp_path: Path
+):
+    """A sign that clustering took for two is joined after the adjustment, which takes some steps more."""
+    clusters = mapper.first_map
+    monkeypatch.setattr(mapper, "first_map", lambda *of: with_a_split_sign(clusters(*of)))
+    whole, out = tmp_path / "whole", tmp_path / "run"
+    assert optimize(small, whole).code == 0
+    metrics = json.loads((whole / "metrics.json").read_text())
+    assert metrics["counts"]["signs joined after the adjustment"] == 1
+    steps = len(metrics["costs"])
+    for begun, cut in pairwise((0, 2, steps - 2, steps - 1)):
+        cuts.calls.clear()
+        cuts.cut = ("adjust_step", cut - begun)
+        with pytest.raises(Interruption):
+            optimize(small, out, *(("--resume",) if begun else ()))
+    cuts.cut = None
+    assert (out / "checkpoint" / "anew.pt").exists()
+    said = optimize(small, out, "--resume")
+    assert said.code == 0 and f"clusters and biases, step {steps - 1}" in said.err
+    assert same_map(out, whole)
 
 
 def test_a_damaged_stage_is_made_anew(optimize, cuts: Cuts, small: Path, tmp_path: Path, run: Path):

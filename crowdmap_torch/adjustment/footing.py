@@ -1,0 +1,78 @@
+"""What an adjustment found beside its landmarks, for another one of the same drives to begin with (V-B).
+
+Where signs turn out to be one, adjustment begins again with fewer of them. What it found of the poses' errors, of cars and
+of noise still holds: begun there, it has a few steps to take, where from wide scales and unknown cars it takes them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.adjustment.bundle import Bundle
+
+_SCALES = (
+    *("scale", "small_box", "lasting"),
+    *("prior_scale", "white_scale", "calibration_scale", "calibration_far"),
+)
+"""What a bundle keeps of noise: of pixels, of poses and of cars."""
+
+
+@dataclass(frozen=True)
+class Footing:
+    """What does not depend on which landmarks there are."""
+
+    frame: Int[Tensor, " n"]
+    """The first frame of each stretch of drift, counted over all journeys."""
+    journey: Int[Tensor, " n"]
+    drift: Float[Tensor, "n k"]
+    steady: Mapping[str, Tensor]
+    """Unknowns of journeys and of cars, by name."""
+    scales: Mapping[str, Tensor]
+    """By name in the bundle."""
+
+
+@torch.no_grad()
+def footing_of(bundle: Bundle) -> Footing:
+    """Where a bundle stands, copied."""
+    values, nodes = bundle.values(), bundle.prior.nodes
+    return Footing(
+        bundle.frame[nodes.first],
+        nodes.journey,
+        values["drift"],
+        {name: values[name] for name in ("bias", *bundle.fleet.start)},
+        {name: getattr(bundle, name).clone() for name in _SCALES},
+    )
+
+
+@torch.no_grad()
+def stand_on(bundle: Bundle, footing: Footing) -> None:
+    """Puts a bundle of the same journeys, not yet adjusted, there.
+
+    A stretch of drift that was none before has that of the one before it in its journey, or of the one behind it. Where
+    biases turned out to wander in one of both alone, what is known of all others holds.
+    """
+    values, nodes = bundle.values(), bundle.prior.nodes
+    values |= footing.steady
+    if len(footing.frame):
+        at = torch.searchsorted(footing.frame, bundle.frame[nodes.first], right=True) - 1
+        before, behind = at.clamp_min(0), (at + 1).clamp_max(len(footing.frame) - 1)
+        row = torch.where(footing.journey[before] == nodes.journey, before, behind)
+        known = (footing.journey[row] == nodes.journey)[:, None]
+        wide = min(values["drift"].shape[1], footing.drift.shape[1])
+        values["drift"][:, :wide] = torch.where(
+            known, footing.drift[row, :wide], values["drift"][:, :wide]
+        )
+        values["cut"] = bundle.prior.at_cuts(values["drift"])
+    for name, there in footing.scales.items():
+        here = getattr(bundle, name)
+        if name == "prior_scale":
+            here = here[:, : there.shape[1]]
+            there = there[:, : here.shape[1]]
+        here.copy_(there)
+    bundle.fold(values)
+    bundle.relinearise()

@@ -1,0 +1,129 @@
+"""An adjustment that begins again: it stands where the one before ended, and has little left to do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from worlds.split_signs import with_a_split_sign
+
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.footing import footing_of
+from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.geometry import se3
+from crowdmap_torch.mapper import FirstMap, MapResult, adjusted_map, build_bundle
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.tables import Dataset
+
+WANDERING = MapperConfig(positioning=PositioningNoise(wander_length_m=200.0))
+"""As if a drive of this length were a long one."""
+STEADY = MapperConfig(positioning=PositioningNoise(wander_sigma_m=0.0))
+
+
+def built(
+    tiny: Dataset, tiny_result: MapResult, first: FirstMap, config: MapperConfig | None = None
+) -> Bundle:
+    return build_bundle(tiny.journeys, tiny_result.journey_maps, first, config or MapperConfig())
+
+
+@pytest.fixture(scope="module")
+def ended(tiny: Dataset, tiny_result: MapResult) -> Bundle:
+    """The first adjustment, at its end."""
+    bundle = built(tiny, tiny_result, tiny_result.first)
+    adjust.adjust(bundle)
+    return bundle
+
+
+def anew(tiny: Dataset, first: FirstMap, bundle: Bundle) -> FirstMap:
+    """The map to begin again with where a bundle stands, its signs those of before."""
+    signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
+    poses = adjust.read_poses(bundle, tiny.journeys)
+    return replace(
+        first, signs=signs, lanes=lanes, drifts=drifts_to(tiny, poses), footing=footing_of(bundle)
+    )
+
+
+def drifts_to(tiny: Dataset, poses: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+    return tuple(se3.local(j.T_world_camera, T) for j, T in zip(tiny.journeys, poses, strict=True))
+
+
+def test_it_stands_where_the_other_one_ended(tiny, tiny_result: MapResult, ended: Bundle):
+    again = built(tiny, tiny_result, anew(tiny, tiny_result.first, ended))
+    for name, value in ended.values().items():
+        assert torch.allclose(again.values()[name], value, atol=1e-9), name
+    for name in ("scale", "lasting", "prior_scale", "white_scale", "calibration_scale"):
+        assert torch.equal(getattr(again, name), getattr(ended, name)), name
+    assert int(again.judged) == 0 and not bool(again.given_up.any())
+
+
+def test_what_was_known_of_cars_and_noise_need_not_be_found_again(
+    tiny, tiny_result: MapResult, ended: Bundle
+):
+    first = anew(tiny, tiny_result.first, ended)
+    off, steps = [], []
+    for begins in (first, replace(first, footing=None)):
+        bundle, taken = built(tiny, tiny_result, begins), 0
+        for taken, _, _ in adjust.steps(bundle, adjust.start(bundle)):
+            if taken == 0:
+                away = bundle.values()["load"] - ended.values()["load"]
+                off.append(float(away.detach().norm()))
+        steps.append(taken)
+        sign = (bundle.values()["sign"] - ended.values()["sign"]).detach()[:, :3, 3]
+        assert float(sign.norm(dim=-1).max()) < 0.03
+    assert off[0] < 0.3 * off[1] and steps[0] <= steps[1]
+
+
+def test_stretches_that_nobody_knew_have_the_drift_beside_them(
+    tiny, tiny_result: MapResult, ended: Bundle
+):
+    footing, nodes = footing_of(ended), ended.prior.nodes
+    kept = torch.arange(len(footing.frame)) % 3 == 1
+    first = anew(tiny, tiny_result.first, ended)
+    some = replace(
+        footing, frame=footing.frame[kept], journey=footing.journey[kept], drift=footing.drift[kept]
+    )
+    drift = built(tiny, tiny_result, replace(first, footing=some)).values()["drift"]
+    known = torch.nonzero(kept)[:, 0]
+    for row in range(len(drift)):
+        own = known[nodes.journey[known] == nodes.journey[row]]
+        before = own[own <= row]
+        beside = before[-1] if len(before) else own[0]
+        assert torch.equal(drift[row], footing.drift[beside])
+    # Of a journey that had no say at all it starts as it would have without.
+    other = footing.journey != 1
+    none = replace(
+        footing,
+        frame=footing.frame[other],
+        journey=footing.journey[other],
+        drift=footing.drift[other],
+    )
+    drift = built(tiny, tiny_result, replace(first, footing=none)).values()["drift"]
+    alone = built(tiny, tiny_result, replace(first, footing=None)).values()["drift"]
+    mine = nodes.journey == 1
+    assert torch.equal(drift[mine], alone[mine])
+    assert torch.equal(drift[~mine], footing.drift[~mine])
+
+
+@pytest.mark.parametrize(("before", "after"), [(STEADY, WANDERING), (WANDERING, STEADY)])
+def test_biases_that_turn_out_to_wander_or_not_to_take_what_both_know(
+    tiny, tiny_result: MapResult, before: MapperConfig, after: MapperConfig
+):
+    bundle = built(tiny, tiny_result, tiny_result.first, before)
+    first = anew(tiny, tiny_result.first, bundle)
+    footing = first.footing
+    assert footing is not None
+    again = built(tiny, tiny_result, first, after)
+    assert again.prior_scale.shape != footing.scales["prior_scale"].shape
+    assert torch.equal(again.values()["drift"][:, :6], footing.drift[:, :6])
+    assert adjust.adjust(again).done
+
+
+def test_a_sign_that_was_taken_for_two_is_one_in_the_end(tiny, tiny_result: MapResult):
+    first = with_a_split_sign(tiny_result.first)
+    found = adjusted_map(tiny, tiny_result.journey_maps, first, MapperConfig())
+    assert found.first.joined == 1 and found.first.anew == 1
+    here, there = (of.hd_map.signs.center_world for of in (found, tiny_result))
+    assert len(here) == len(there)
+    assert float(torch.cdist(there, here).amin(1).max()) < 0.05
