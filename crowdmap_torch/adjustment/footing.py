@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.bundle import Bundle
@@ -34,6 +34,10 @@ class Footing:
     """Unknowns of journeys and of cars, by name."""
     scales: Mapping[str, Tensor]
     """By name in the bundle."""
+    judged: bool
+    """Whether detections were judged by everything else."""
+    given_up: Bool[Tensor, " d"]
+    """Detections, by number, that had no say then."""
 
 
 @torch.no_grad()
@@ -46,6 +50,8 @@ def footing_of(bundle: Bundle) -> Footing:
         values["drift"],
         {name: values[name] for name in ("bias", *bundle.fleet.start)},
         {name: getattr(bundle, name).clone() for name in _SCALES},
+        int(bundle.judged) > 0,
+        bundle.given_up.clone(),
     )
 
 
@@ -54,7 +60,8 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
     """Puts a bundle of the same journeys, not yet adjusted, there.
 
     A stretch of drift that was none before has that of the one before it in its journey, or of the one behind it. Where
-    biases turned out to wander in one of both alone, what is known of all others holds.
+    biases turned out to wander in one of both alone, what is known of all others holds. Detections that had no say have
+    none until they are judged once more.
     """
     values, nodes = bundle.values(), bundle.prior.nodes
     values |= footing.steady
@@ -74,5 +81,8 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
             here = here[:, : there.shape[1]]
             there = there[:, : here.shape[1]]
         here.copy_(there)
+    bundle.judged.fill_(footing.judged)
+    both = min(len(bundle.given_up), len(footing.given_up))
+    bundle.given_up[:both] = footing.given_up[:both]
     bundle.fold(values)
     bundle.relinearise()
