@@ -17,8 +17,8 @@ from torch import Tensor
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
+from crowdmap_torch.adjustment.detection_lanes import with_lanes
 from crowdmap_torch.adjustment.footing import Footing, footing_of
-from crowdmap_torch.adjustment.lane_matching import with_lanes
 from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
 from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_lanes
@@ -182,8 +182,7 @@ def map_journeys(
     mapped with their numbers, as soon as each is there. ChildProcessError, with the journey's name, if the worker of a
     journey is killed again and again.
     """
-    stage, total = "single journeys", len(journeys)
-    maps = dict(known or {})
+    stage, total, maps = "single journeys", len(journeys), dict(known or {})
     progress(stage, len(maps), total)
     left = [number for number in range(total) if number not in maps]
     if engine is None or any(journeys[number].t_ns.is_cuda for number in left[:1]):
@@ -349,6 +348,7 @@ def adjusted_map(
         if again is None:
             return finish_map(dataset, maps, first, bundle, state, config, engine, known)
         first = again
+        del bundle, begun, state
 
 
 @one_core_each()
@@ -371,7 +371,7 @@ def made_anew(
     if is_last or not len(may_be_one(signs, journeys, first.associations, rules)):
         return None, None
     known = map_uncertainty(bundle, first.signs, first.lanes, engine)
-    signs = replace(signs, covariance=known.center - known.shared)
+    signs = replace(signs, covariance=known.of_their_own)
     found = associated_once(
         *(journeys, poses := adjust.read_poses(bundle, journeys), [m.sign_tracklets for m in maps]),
         AssociatedSigns(signs, first.tentative, first.associations, first.completed),

@@ -54,6 +54,15 @@ class MapUncertainty:
     calibration_mean_sigma: dict[str, tuple[float, ...]]
     """1-sigma of its mean over all cars, by parameter."""
 
+    @property
+    def of_their_own(self) -> Float[Tensor, "n 3 3"]:
+        """Covariance of the signs' centres without what all positions share [m^2].
+
+        That is found of some places: along axes where a sign is surer than that, nothing is left.
+        """
+        left, axes = torch.linalg.eigh(self.center - self.shared)
+        return (axes * left.clamp_min(0)[:, None]) @ axes.mT
+
 
 @torch.no_grad()
 def map_uncertainty(

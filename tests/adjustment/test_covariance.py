@@ -72,6 +72,14 @@ def dense(bundle: Bundle):
     return covariance, columns
 
 
+def test_what_signs_have_to_themselves_is_never_less_than_nothing(found: MapUncertainty):
+    assert torch.allclose(found.of_their_own, found.center - found.shared, atol=1e-12)
+    sure = torch.eye(3).double()[None] * torch.tensor([1e-4, 1.0, 4.0]).double()
+    found = replace(found, center=sure, shared=torch.eye(3).double())
+    expected = torch.tensor([0.0, 0.0, 3.0]).double()
+    assert torch.allclose(found.of_their_own, expected.diag()[None])
+
+
 def test_centres_and_what_they_share_are_blocks_of_the_inverse(found: MapUncertainty, dense):
     covariance, columns = dense
     at = columns("sign")[:, :3]

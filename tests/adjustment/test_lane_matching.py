@@ -9,10 +9,10 @@ from torch import Tensor
 from worlds.drives import make_journey
 from worlds.small_world import Builder
 
+from crowdmap_torch.adjustment.detection_lanes import detection_lanes
 from crowdmap_torch.adjustment.lane_matching import (
     LaneMatches,
     Shifts,
-    detection_lanes,
     follow,
     nearest_lanes,
     sample_parameters,
