@@ -64,9 +64,8 @@ _LASTING_RESTS = 0.1
 class Bundle(BundleState):
     """The problem that unknowns and observations make, and how its scales follow from step to step."""
 
-    whole: Bundle
-    """That of all drives: itself, but of the leader of some that are shared out."""
     plan: EliminationPlan
+    _others: Bundle | None
 
     def __init__(
         self,
@@ -80,8 +79,13 @@ class Bundle(BundleState):
         """All drives, or such as are `shared_out`; their leader has the `whole` beside it, with everybody's observations."""
         super().__init__(unknowns, observations, priors, config, shared_out)
         # Not a module of this one.
-        object.__setattr__(self, "whole", self if whole is None else whole)
+        object.__setattr__(self, "_others", whole)
         self.plan = self._elimination() if shared_out is None else shared_out.plan
+
+    @property
+    def whole(self) -> Bundle:
+        """That of all drives: itself, but of the leader of some that are shared out."""
+        return self._others or self
 
     @torch.no_grad()
     def _elimination(self) -> EliminationPlan:

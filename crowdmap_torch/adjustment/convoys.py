@@ -225,12 +225,13 @@ class Convoys(ExitStack):
     def _ended(self, kind: type[BaseException] | None, *_: object) -> None:
         """Has the lenses of the bundle follow, unless all ends in an error.
 
-        Factors as large as the map go at once: what refers to itself in a circle stays until somebody looks.
+        What is as large as the map goes at once: what refers to itself in a circle stays until somebody looks.
         """
         self._own.forget_factors()
         self._state = self._state and replace(self._state, normal=None)
         if kind is None or issubclass(kind, GeneratorExit):
             self.bundle.relinearise()
+        del self._own, self._company, self._leader, self.bundle
 
     def _program(self, number: int) -> Program:
         return drive_along, alone(convoy(self.bundle, self.state, *self._parts[number]))

@@ -226,6 +226,7 @@ def _map(
             if again is None:
                 break
             last, step = kept.keep_anew(again, watch.course), None
+            del bundle, begun, state  # As large as the next ones.
 
         # ---- the map ----
         progress("covariances and map")
@@ -254,8 +255,7 @@ def _map(
             record = record_of(dataset, result, config, watch, *known, _facts(options, given.cut))
             write_report(folder.unfinished / folder.report.name, record)
     kept.finish()
-    print(counts_line(dataset, result, config))
-    print(f"map: {folder.map}\nreport: {folder.report}")
+    print(f"{counts_line(dataset, result, config)}\nmap: {folder.map}\nreport: {folder.report}")
     return EMPTY_MAP if options.strict and missing else 0
 
 

@@ -180,6 +180,21 @@ def test_factors_go_with_their_convoys(street):
         gc.enable()
 
 
+@pytest.mark.parametrize("convoy_m", [0.0, 50.0])
+def test_a_bundle_goes_with_the_last_who_has_it(street, convoy_m: float):
+    """What refers to itself in a circle stays until somebody looks: two adjustments would be in memory."""
+    bundle = bundle_of(street, convoy_m=convoy_m)
+    there = weakref.ref(bundle)
+    gc.disable()
+    try:
+        assert all(seen() for _, _, seen in adjust.steps(bundle, adjust.start(bundle)))
+        map_uncertainty(bundle, street.signs, street.lanes)
+        del bundle
+        assert there() is None
+    finally:
+        gc.enable()
+
+
 def test_a_summary_shows_some_of_many_rows(street, monkeypatch):
     bundle = bundle_of(street, convoy_m=0.0)
     adjust.start(bundle)
