@@ -12,7 +12,7 @@ from crowdmap_torch.adjustment import calibration_priors
 from crowdmap_torch.adjustment.bundle_state import BundleState
 from crowdmap_torch.adjustment.calibration_scales import rescaled as rescaled_calibrations
 from crowdmap_torch.adjustment.config import AdjustConfig
-from crowdmap_torch.adjustment.landmark_terms import size_class_term, slide_term
+from crowdmap_torch.adjustment.landmark_terms import about_usual_size, size_class_term, slide_term
 from crowdmap_torch.adjustment.lane_matching import follow
 from crowdmap_torch.adjustment.lane_terms import lane_point_terms
 from crowdmap_torch.adjustment.observations import CornerObservations
@@ -307,7 +307,10 @@ class Bundle(BundleState):
         terms = self.prior.terms(prior_scale, self.white_scale)
         if self.together.leads:
             terms |= self.fixed | calibration_priors.priors(self.fleet, self.calibration_scales)
-            terms |= size_class_term(self.values()["size"], self.config)
+            size = self.values()["size"]
+            terms |= size_class_term(size, self.config)
+            if "sign_habit" in terms:
+                terms |= about_usual_size(terms["sign_habit"], size, self.config.habit)
         terms["pose_white"] = self.fleet.of_poses(terms["pose_white"], self._by_mount)
         terms.update(self._corner_term(self.corner_sigma()))
         terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -10,6 +12,29 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.residuals import lane, sign_prior
+from crowdmap_torch.residuals.sign_prior import SignHabit
+
+_LOG_USUAL = 0.4
+"""1-sigma of the logarithms of the width and height that are usual on a map, about those of `SignHabit`."""
+
+
+def about_usual_size(
+    term: CostTerm, size: Float[Tensor, "n 2"], habit: SignHabit
+) -> dict[str, CostTerm]:
+    """`habit_term` about the sizes that are usual among the map's own signs.
+
+    What is usual is unknown, and the same for all: of many signs their mean, of few what `habit` says. About a size that is
+    given, thousands of signs that are a little larger would together be as sure of it as of a measurement, and where
+    detectors may draw all outlines too large, which no image tells from large signs, the map would be scaled to it.
+    """
+    (_, own), *_ = term.slots
+    size = size.detach()[own]
+    typical = size.new_full((2,), habit.typical_size_m).log()
+    among = habit.log_size**2 / max(len(own), 1)
+    share = _LOG_USUAL**2 / (_LOG_USUAL**2 + among)
+    usual = (typical + share * (size.log().mean(0) - typical)).exp()
+    facing, before = term.constants
+    return {"sign_habit": replace(term, constants=(facing, usual.expand_as(before)))}
 
 
 def size_class_term(size: Float[Tensor, "n 2"], config: AdjustConfig) -> dict[str, CostTerm]:

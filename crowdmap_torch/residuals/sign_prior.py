@@ -26,7 +26,7 @@ class SignHabit(Settings):
     upright_rad: SigmaOrOff = 0.1
     """Roll and tilt."""
     typical_size_m: Length = 0.75
-    """Median width and height."""
+    """Median width and height; in the adjustment of many signs their own."""
     log_size: SigmaOrOff = 0.8
     """Logarithms of width and height about that."""
 

@@ -74,10 +74,10 @@ def dense(bundle: Bundle):
 
 def test_what_signs_have_to_themselves_is_never_less_than_nothing(found: MapUncertainty):
     assert torch.allclose(found.of_their_own, found.center - found.shared, atol=1e-12)
-    sure = torch.eye(3).double()[None] * torch.tensor([1e-4, 1.0, 4.0]).double()
+    sure = torch.tensor([1e-4, 1.0, 4.0]).double().diag().expand_as(found.center)
     found = replace(found, center=sure, shared=torch.eye(3).double())
-    expected = torch.tensor([0.0, 0.0, 3.0]).double()
-    assert torch.allclose(found.of_their_own, expected.diag()[None])
+    expected = torch.tensor([0.0, 0.0, 3.0]).double().diag()
+    assert torch.allclose(found.of_their_own, expected.expand_as(sure))
 
 
 def test_centres_and_what_they_share_are_blocks_of_the_inverse(found: MapUncertainty, dense):

@@ -9,7 +9,10 @@ from worlds.adjusted_street import Adjusted, Street
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import CalibrationConfig, columns
 from crowdmap_torch.adjustment.config import AdjustConfig
+from crowdmap_torch.adjustment.landmark_terms import about_usual_size
+from crowdmap_torch.residuals.sign_prior import SignHabit, habit_term
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +38,33 @@ def test_signs_of_no_class_keep_their_sizes(street: Street, adjusted: Adjusted, 
     adjust.adjust(bundle)
     found, expected = bundle.values()["size"], adjusted.bundle.values()["size"]
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+
+
+def test_many_signs_tell_what_size_is_usual_and_one_hardly():
+    size = 1.5 * torch.linspace(-0.5, 0.5, 2001).double().exp()[:, None] * torch.ones(1, 2).double()
+
+    def usual(some: Tensor) -> Tensor:
+        own = torch.arange(len(some))
+        term = habit_term(torch.zeros(len(own), 3).double(), own, SignHabit())
+        return about_usual_size(term, some, SignHabit())["sign_habit"].constants[1]
+
+    assert torch.allclose(usual(size), torch.tensor(1.5).double(), rtol=2e-3)
+    assert 0.8 < float(usual(size[1000:1001])[0, 0]) < 1.1
+    # Signs that nobody sees tell nothing.
+    term = habit_term(torch.zeros(3, 3).double(), own := torch.arange(3), SignHabit())
+    more = torch.cat((size[own], 100 * size[own]))
+    seen, alone = (about_usual_size(term, of, SignHabit()) for of in (more, size[own]))
+    assert torch.equal(seen["sign_habit"].constants[1], alone["sign_habit"].constants[1])
+
+
+def test_signs_of_an_unusual_size_do_not_scale_the_map(street: Street):
+    """Whether a detector draws all outlines too large no image tells from large signs: usual sizes must not either."""
+    habit = SignHabit(typical_size_m=3.0, log_size=0.2)
+    bundle = street.bundle(config=AdjustConfig(habit=habit), calibration=CalibrationConfig())
+    adjust.adjust(bundle)
+    box = columns("optics", CalibrationConfig())["box"]
+    assert float(bundle.values()["optics"][:, box].detach().abs().max()) < 0.5
+    assert float(size_error(bundle, street).detach().mean()) < 0.02
 
 
 @pytest.mark.parametrize(
