@@ -14,7 +14,7 @@ from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.residuals import lane, sign_prior
 from crowdmap_torch.residuals.sign_prior import SignHabit
 
-_LOG_USUAL = 0.4
+_LOG_USUAL = 0.25
 """1-sigma of the logarithms of the width and height that are usual on a map, about those of `SignHabit`."""
 
 

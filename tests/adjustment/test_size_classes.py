@@ -48,8 +48,8 @@ def test_many_signs_tell_what_size_is_usual_and_one_hardly():
         term = habit_term(torch.zeros(len(own), 3).double(), own, SignHabit())
         return about_usual_size(term, some, SignHabit())["sign_habit"].constants[1]
 
-    assert torch.allclose(usual(size), torch.tensor(1.5).double(), rtol=2e-3)
-    assert 0.8 < float(usual(size[1000:1001])[0, 0]) < 1.1
+    assert torch.allclose(usual(size), torch.tensor(1.5).double(), rtol=5e-3)
+    assert 0.76 < float(usual(size[1000:1001])[0, 0]) < 1.1
     # Signs that nobody sees tell nothing.
     term = habit_term(torch.zeros(3, 3).double(), own := torch.arange(3), SignHabit())
     more = torch.cat((size[own], 100 * size[own]))
