@@ -23,6 +23,7 @@ from crowdmap_torch.adjustment.found_calibration import (
 )
 from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.geometry import polygon, se3, spline_basis
+from crowdmap_torch.geometry.covariances import at_least
 from crowdmap_torch.optim.problem import Values
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, MapCovariance
 from crowdmap_torch.tables import Lanes, Signs
@@ -60,8 +61,7 @@ class MapUncertainty:
 
         That is found of some places: along axes where a sign is surer than that, nothing is left.
         """
-        left, axes = torch.linalg.eigh(self.center - self.shared)
-        return (axes * left.clamp_min(0)[:, None]) @ axes.mT
+        return at_least(self.center - self.shared, 0.0)
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from crowdmap_torch.evaluation.signs import SignComparison
 from crowdmap_torch.evaluation.statistics import share
+from crowdmap_torch.geometry.covariances import at_least
 from crowdmap_torch.tables import Signs
 
 _CHI2_3_95 = 7.814727903251179
@@ -58,7 +59,7 @@ def evaluate_uncertainty(
     has_shared = float(shared.diagonal().min()) > 0
     left = signs.covariance - shared
     common = _common_of_own(left[is_known]) if has_shared else torch.zeros_like(shared)
-    own = _at_least(left[row] + common, _LEAST_SIGMA_M)
+    own = at_least(left[row] + common, _LEAST_SIGMA_M)
     if survey_sigma is not None:
         eye = torch.eye(3, dtype=own.dtype, device=own.device)
         own = own + survey_sigma[true_row].square()[:, None, None] * eye
@@ -74,7 +75,7 @@ def evaluate_uncertainty(
         nees = _squared(error - shift, own * (1 - 2 / n) + of_mean)
         coverage, mean_nees = share(int((nees <= _CHI2_3_95).sum()), n), float(nees.mean())
     if has_shared:
-        of_shift = _at_least((shared - common + of_mean)[None], _LEAST_SIGMA_M)
+        of_shift = at_least((shared - common + of_mean)[None], _LEAST_SIGMA_M)
         shared_nees = float(_squared(shift[None], of_shift))
     return UncertaintyFigures(n, coverage, mean_nees, shared_nees)
 
@@ -89,7 +90,7 @@ def _common_of_own(left: Float[Tensor, "n 3 3"]) -> Float[Tensor, "3 3"]:
     """
     if len(left) < 2:
         return left.new_zeros(3, 3)
-    left = _at_least(left, _LEAST_SIGMA_M)
+    left = at_least(left, _LEAST_SIGMA_M)
     H, eye = left.mean(0) / (len(left) - 1), torch.eye(9, dtype=left.dtype, device=left.device)
     for _ in range(_NEWTON_STEPS):
         inverse = torch.linalg.inv(left + H)
@@ -108,8 +109,3 @@ def _squared(
 ) -> Float[Tensor, " n"]:
     solved = torch.linalg.solve(covariance, error[..., None])[..., 0]
     return (error * solved).sum(-1)
-
-
-def _at_least(covariance: Float[Tensor, "n 3 3"], sigma_m: float) -> Float[Tensor, "n 3 3"]:
-    value, vector = torch.linalg.eigh((covariance + covariance.mT) / 2)
-    return (vector * value.clamp_min(sigma_m**2)[..., None, :]) @ vector.mT
