@@ -310,7 +310,8 @@ class Bundle(BundleState):
             size = self.values()["size"]
             terms |= size_class_term(size, self.config)
             if "sign_habit" in terms:
-                terms |= about_usual_size(terms["sign_habit"], size, self.config.habit)
+                habit = about_usual_size(terms["sign_habit"], size, self.config.habit)
+                terms["sign_habit"] = habit
         terms["pose_white"] = self.fleet.of_poses(terms["pose_white"], self._by_mount)
         terms.update(self._corner_term(self.corner_sigma()))
         terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))

@@ -61,7 +61,7 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
 
     A stretch of drift that was none before has that of the one before it in its journey, or of the one behind it. Where
     biases turned out to wander in one of both alone, what is known of all others holds. Detections that had no say have
-    none until they are judged once more.
+    none until they are judged once more. Lenses follow as the adjustment starts.
     """
     values, nodes = bundle.values(), bundle.prior.nodes
     values |= footing.steady
@@ -85,4 +85,3 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
     both = min(len(bundle.given_up), len(footing.given_up))
     bundle.given_up[:both] = footing.given_up[:both]
     bundle.fold(values)
-    bundle.relinearise()

@@ -18,9 +18,7 @@ _LOG_USUAL = 0.25
 """1-sigma of the logarithms of the width and height that are usual on a map, about those of `SignHabit`."""
 
 
-def about_usual_size(
-    term: CostTerm, size: Float[Tensor, "n 2"], habit: SignHabit
-) -> dict[str, CostTerm]:
+def about_usual_size(term: CostTerm, size: Float[Tensor, "n 2"], habit: SignHabit) -> CostTerm:
     """`habit_term` about the sizes that are usual among the map's own signs.
 
     What is usual is unknown, and the same for all: of many signs their mean, of few what `habit` says. About a size that is
@@ -34,7 +32,7 @@ def about_usual_size(
     share = _LOG_USUAL**2 / (_LOG_USUAL**2 + among)
     usual = (typical + share * (size.log().mean(0) - typical)).exp()
     facing, before = term.constants
-    return {"sign_habit": replace(term, constants=(facing, usual.expand_as(before)))}
+    return replace(term, constants=(facing, usual.expand_as(before)))
 
 
 def size_class_term(size: Float[Tensor, "n 2"], config: AdjustConfig) -> dict[str, CostTerm]:

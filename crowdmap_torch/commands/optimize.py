@@ -222,7 +222,7 @@ def _map(
                 kept.keep_start(watch.start(bundle, mapper.clusters_map(dataset, first)))
             watch.follow(last.signs, last.lanes, bundle if last.anew and step is None else None)
             state, by = _adjusted(bundle, begun, step, last.anew, kept, watch, where, progress)
-            again, known = mapper.made_anew(journeys, maps, last, bundle, config, by)
+            again, uncertainty = mapper.made_anew(journeys, maps, last, bundle, config, by)
             if again is None:
                 break
             last, step = kept.keep_anew(again, watch.course), None
@@ -230,7 +230,7 @@ def _map(
 
         # ---- the map ----
         progress("covariances and map")
-        result = mapper.finish_map(dataset, maps, last, bundle, state, config, by, known)
+        result = mapper.finish_map(dataset, maps, last, bundle, state, config, by, uncertainty)
         watch.finish(bundle, result.hd_map)
     # What follows is written and drawn: on the CPU, wherever it was made.
     dataset, result = to_device((dataset, result), "cpu")

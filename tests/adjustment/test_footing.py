@@ -40,13 +40,8 @@ def anew(tiny: Dataset, first: FirstMap, bundle: Bundle) -> FirstMap:
     """The map to begin again with where a bundle stands, its signs those of before."""
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
     poses = adjust.read_poses(bundle, tiny.journeys)
-    return replace(
-        first, signs=signs, lanes=lanes, drifts=drifts_to(tiny, poses), footing=footing_of(bundle)
-    )
-
-
-def drifts_to(tiny: Dataset, poses: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
-    return tuple(se3.local(j.T_world_camera, T) for j, T in zip(tiny.journeys, poses, strict=True))
+    drifts = tuple(map(se3.local, (journey.T_world_camera for journey in tiny.journeys), poses))
+    return replace(first, signs=signs, lanes=lanes, drifts=drifts, footing=footing_of(bundle))
 
 
 def test_it_stands_where_the_other_one_ended(tiny, tiny_result: MapResult, ended: Bundle):

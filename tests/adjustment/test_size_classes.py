@@ -46,7 +46,7 @@ def test_many_signs_tell_what_size_is_usual_and_one_hardly():
     def usual(some: Tensor) -> Tensor:
         own = torch.arange(len(some))
         term = habit_term(torch.zeros(len(own), 3).double(), own, SignHabit())
-        return about_usual_size(term, some, SignHabit())["sign_habit"].constants[1]
+        return about_usual_size(term, some, SignHabit()).constants[1]
 
     assert torch.allclose(usual(size), torch.tensor(1.5).double(), rtol=5e-3)
     assert 0.76 < float(usual(size[1000:1001])[0, 0]) < 1.1
@@ -54,7 +54,7 @@ def test_many_signs_tell_what_size_is_usual_and_one_hardly():
     term = habit_term(torch.zeros(3, 3).double(), own := torch.arange(3), SignHabit())
     more = torch.cat((size[own], 100 * size[own]))
     seen, alone = (about_usual_size(term, of, SignHabit()) for of in (more, size[own]))
-    assert torch.equal(seen["sign_habit"].constants[1], alone["sign_habit"].constants[1])
+    assert torch.equal(seen.constants[1], alone.constants[1])
 
 
 def test_signs_of_an_unusual_size_do_not_scale_the_map(street: Street):
