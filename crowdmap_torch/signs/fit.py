@@ -71,7 +71,8 @@ class SignFitConfig(Settings):
     pixels: PixelNoiseConfig = field(default_factory=PixelNoiseConfig)
     """Noise of the corners."""
     max_noise_scale: Deviations = 4.0
-    """The noise of each sign's corners is estimated from its own residuals, up to this multiple of the above."""
+    """The noise of each sign's corners is estimated from its own residuals, up to this multiple of the above, or of that of
+    the drive where its signs show more."""
     white_share: Share = 0.8
     """Share of the usual white noise of positions that is taken for one drive's: with all of it signs that a few frames
     place to half a metre are pruned."""
@@ -193,14 +194,14 @@ def fit_signs_coarsely(
 
 
 def robust_noise_scale(
-    error_sq: Float[Tensor, " m"], sign: Int[Tensor, " m"], count: int, most: float
+    error_sq: Float[Tensor, " m"], sign: Int[Tensor, " m"], count: int
 ) -> Float[Tensor, " count"]:
-    """By how much the noise of each sign's views exceeds what was assumed: root of the median mean square, 1 to `most`."""
+    """The noise of each sign's views as a multiple of what was assumed, at least 1: root of the median mean square."""
     order = torch.argsort(error_sq)
     order = order[torch.argsort(sign[order], stable=True)]
     number = torch.bincount(sign, minlength=count)
     middle = number.cumsum(0) - number + number.div(2, rounding_mode="floor")
-    return error_sq[order][middle].sqrt().clamp(1.0, most)
+    return error_sq[order][middle].sqrt().clamp_min(1.0)
 
 
 def _problem(

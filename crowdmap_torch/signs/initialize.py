@@ -27,6 +27,12 @@ NEAR_ENOUGH_RAD = 2e-3
 """Rays this close to a point agree with it: their weights do not grow further."""
 MAX_SIZE_RATIO = 3.0
 """A plane whose size differs by more from the boxes' size is taken for a misfit."""
+_AS_ASSUMED = 48.0
+"""Views with the noise that is assumed that count beside those of a drive: three tracklets' worth."""
+_MUCH_NOISIER = 1.3
+"""A drive that is noisier by less has the noise that is assumed; each sign has a scale of its own beside."""
+_ROUNDS = 3
+"""How often a drive's noise is found at most: far from what is assumed its signs are not placed well at first."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +132,55 @@ def choose_starts(
     size_limits: tuple[float, float],
 ) -> tuple[SignStart, Float[Tensor, " n"]]:
     """Signs fitted one by one from several starts, of each the best; and their noise scales."""
-    n = len(shape)
     few = views[thinned(views, config.max_views)]
-    m = len(few)
+    start, scale = _best_starts(few, shape, positioning, config, fit, size_limits)
+    return start, scale.clamp(1.0, fit.max_noise_scale)
+
+
+def choose_starts_of_drive(
+    views: SignViews,
+    shape: Int[Tensor, " n"],
+    positioning: PositioningNoise,
+    config: SignStartConfig,
+    fit: SignFitConfig,
+    *,
+    size_limits: tuple[float, float],
+) -> tuple[SignStart, Float[Tensor, " n"], SignFitConfig]:
+    """The same of all signs of a drive, and `fit` with corners as noisy as this drive's are, if that is more.
+
+    Cameras of many pixels, and detectors that look at pictures made smaller, have a noise of their own: by a bound on what
+    is usual all of their signs would be pruned. The noise scales are multiples of the drive's.
+    """
+    few = views[thinned(views, config.max_views)]
+    start, scale = _best_starts(few, shape, positioning, config, fit, size_limits)
+    for _ in range(_ROUNDS - 1):
+        usual = _usual_scale(scale, few.sign)
+        if usual < _MUCH_NOISIER:
+            break
+        pixels = replace(fit.pixels, sigma_px=usual * fit.pixels.sigma_px)
+        fit = replace(fit, pixels=pixels)
+        start, scale = _best_starts(few, shape, positioning, config, fit, size_limits)
+    return start, scale.clamp(1.0, fit.max_noise_scale), fit
+
+
+def _usual_scale(scale: Float[Tensor, " n"], sign: Int[Tensor, " m"]) -> float:
+    """Median of the noise scales over the views of a drive, and some that have what is assumed."""
+    weight = torch.bincount(sign, minlength=len(scale)).to(scale)
+    every, order = torch.cat((scale, scale.new_ones(1))).sort()
+    below = torch.cat((weight, weight.new_full((1,), _AS_ASSUMED)))[order].cumsum(0)
+    return float(every[torch.searchsorted(below, below[-1:] / 2)])
+
+
+def _best_starts(
+    few: SignViews,
+    shape: Int[Tensor, " n"],
+    positioning: PositioningNoise,
+    config: SignStartConfig,
+    fit: SignFitConfig,
+    size_limits: tuple[float, float],
+) -> tuple[SignStart, Float[Tensor, " n"]]:
+    """The best starts by a few views of each sign, and their noise scales, however large."""
+    n, m = len(shape), len(few)
     centre = centre_points(few, n, typical_height_m=fit.habit.typical_size_m)
     facing = against_the_drive(few.T_world_camera, few.sign, n)
     yaws = tuple(math.radians(yaw) for yaw in config.yaw_deg)
@@ -148,7 +200,7 @@ def choose_starts(
     choice = cost.argmin(0)
     best = choice * n + torch.arange(n, device=shape.device)
     view = choice[few.sign] * m + torch.arange(m, device=shape.device)
-    scale = robust_noise_scale(coarse.error_sq[view], few.sign, n, fit.max_noise_scale)
+    scale = robust_noise_scale(coarse.error_sq[view], few.sign, n)
     return SignStart(coarse.start.T_world_sign[best], coarse.start.size[best]), scale
 
 

@@ -28,7 +28,11 @@ from crowdmap_torch.residuals.sign_prior import against_the_drive
 from crowdmap_torch.road.nonholonomic import DrivePath, drive_path
 from crowdmap_torch.signs.fit import SignFitConfig, fit_signs
 from crowdmap_torch.signs.fit_alone import center_axis_size, fit_signs_alone, mid_points
-from crowdmap_torch.signs.initialize import SignStartConfig, choose_starts, choose_starts_again
+from crowdmap_torch.signs.initialize import (
+    SignStartConfig,
+    choose_starts_again,
+    choose_starts_of_drive,
+)
 from crowdmap_torch.signs.merge_tracks import RejoinConfig, rejoin, relabelled
 from crowdmap_torch.signs.views import SignFit, SignStart, SignViews, distance_away
 from crowdmap_torch.tables import Journey, Signs, Tracklets
@@ -67,7 +71,7 @@ class SignTriangulationConfig(Settings):
     max_distance_m: Length = 80.0
     """Tracklets whose closest view is further away are pruned."""
     max_noise_scale: Deviations = 3.9
-    """Tracklets whose views are noisier, as a multiple of the noise expected, are pruned."""
+    """Tracklets whose views are noisier, as a multiple of the noise expected, or of that of the drive, are pruned."""
     min_inlier_share: Share = 0.5
     """Tracklets of whose views fewer agree with the sign are pruned."""
     max_sigma_m: Sigma = 1.5
@@ -191,9 +195,10 @@ def _fit_jointly(
 ) -> _Fitted:
     label, rows, views = seen.label, seen.rows, seen.views
     limits = config.size_m
-    start, scale = choose_starts(
+    start, scale, of_drive = choose_starts_of_drive(
         views, shape[label], positioning, config.start, config.fit, size_limits=limits
     )
+    config = replace(config, fit=of_drive)
     fit = _fit(views, shape[label], start, scale, drive, positioning, config)
 
     t_s = (journey.t_ns - journey.t_ns[0]).to(fit.size) * 1e-9

@@ -17,6 +17,7 @@ from crowdmap_torch.signs.initialize import (
     centre_points,
     choose_starts,
     choose_starts_again,
+    choose_starts_of_drive,
     starts,
 )
 from crowdmap_torch.signs.triangulate import views_of
@@ -82,3 +83,14 @@ def test_starts_chosen_again_leave_the_others_alone(drive: SignDrive):
     )
     assert torch.equal(found.T_world_sign[~again], moved[~again])
     assert torch.allclose(found.T_world_sign[again], first.T_world_sign[again], atol=1e-6)
+
+
+@pytest.mark.parametrize(("noise_px", "least", "most"), [(0.5, 1.0, 1.0), (4.0, 4.5, 9.0)])
+def test_corners_are_as_noisy_as_the_drive_shows(noise_px: float, least: float, most: float):
+    centers = [(3.5 * (-1) ** i, 60.0 + 5.0 * i, 2.5) for i in range(8)]
+    drive = drive_past(straight_poses(120), signs_at(centers), noise_px=noise_px)
+    *_, scale, fit = choose_starts_of_drive(
+        seen(drive), drive.shape, NOISE, START, FIT, size_limits=LIMITS
+    )
+    assert least <= fit.pixels.sigma_px / FIT.pixels.sigma_px <= most
+    assert scale.median() < 1.3

@@ -243,6 +243,31 @@ def test_few_frames_are_pruned_and_counted(street):
     assert bool((report.reason == FEW_FRAMES).all())
 
 
+@pytest.mark.parametrize("noise_px", [2.5, 5.0])
+def test_a_noisy_detector_costs_no_sign(noise_px: float):
+    """As of a camera of many pixels: by a bound in multiples of 0.6 px half of the signs, or all, were pruned."""
+    drive = drive_past(
+        straight_poses(80),
+        signs_at(ALONG_THE_ROAD, yaw_deg=8.0),
+        shape=ALL_SHAPES,
+        noise_px=noise_px,
+    )
+    signs, _ = triangulate_signs(drive.journey, by_truth(drive), NOISE, CONFIG)
+    assert len(signs) == len(ALL_SHAPES)
+    assert float(corner_errors(signs, drive).mean()) < 0.05 * noise_px
+
+
+def test_a_sign_much_noisier_than_the_others_is_pruned(street):
+    """It would be a false one: what is usual follows the others."""
+    noisy = street.sign == 2
+    generator = torch.Generator().manual_seed(5)
+    noise = 6.0 * torch.randn(int(noisy.sum()), 8, 2, dtype=F64, generator=generator)
+    drive = moved_corners(street, noisy.nonzero()[:, 0], noise)
+    _, report = triangulate_signs(drive.journey, by_truth(street), NOISE, CONFIG)
+    assert REASONS[int(report.reason[2])] == "residual too large"
+    assert report.pruned["kept"] == len(ALL_SHAPES) - 1
+
+
 def test_a_standing_car_maps_nothing_new():
     """No parallax, no place: whatever was seen from one spot is pruned, and no error is raised."""
     drive = drive_past(straight_poses(1).expand(60, 4, 4), signs_at(ALONG_THE_ROAD), noise_px=0.5)

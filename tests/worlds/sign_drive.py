@@ -116,10 +116,12 @@ def with_signs(drive: SignDrive, **columns: Tensor) -> SignDrive:
     return replace(drive, journey=journey)
 
 
-def moved_corners(drive: SignDrive, row: int, push_px: tuple[float, float]) -> SignDrive:
-    """The same drive with all corners of one detection pushed aside."""
+def moved_corners(
+    drive: SignDrive, row: int | Tensor, push_px: tuple[float, float] | Tensor
+) -> SignDrive:
+    """The same drive with the corners of one detection, or of some, pushed aside."""
     px = drive.journey.signs.corners_px.clone()
-    px[row] += torch.tensor(push_px, dtype=F64)
+    px[row] += torch.as_tensor(push_px, dtype=F64)
     return with_signs(drive, corners_px=px, corners_ideal=cameras.unproject(CAMERA, px)[0])
 
 
