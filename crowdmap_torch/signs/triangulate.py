@@ -52,6 +52,8 @@ REASONS = (
 )
 """What becomes of a tracklet, by code."""
 KEPT, FEW_FRAMES, NO_PARALLAX, TOO_FAR, BEHIND, RESIDUAL, UNCERTAIN, SIZE, REJOINED = range(9)
+_VIEWS_BESIDE = 20.0
+"""Views in long tracklets that count beside those of a drive: a few short runs may be all that a drive without signs has."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ class SignTriangulationConfig(Settings):
     max_sigma_m: Sigma = 1.5
     """Tracklets whose centre has a larger standard deviation in any direction are pruned."""
     doubtful_frames: Count = 10
-    """Tracklets with fewer views in agreement must be better placed than others: false detections come in short runs."""
+    """Tracklets with fewer views in agreement must be better placed than others, unless a drive's signs are seen hardly any
+    longer: false detections come in short runs."""
     max_doubtful_sigma_m: Sigma = 0.5
     """Largest standard deviation of those."""
     size_m: Span = (0.1, 16.5)
@@ -300,8 +303,6 @@ def _fates(
     number = group_sum(torch.ones_like(agrees), views.sign, n)
     sigma = torch.linalg.eigvalsh(fit.covariance)[:, -1].clamp_min(0).sqrt()
     agreeing = group_sum(agrees, views.sign, n)
-    is_doubtful = agreeing < config.doubtful_frames
-    doubtful = min(config.max_doubtful_sigma_m, config.max_sigma_m)
     low, high = config.size_m
     tests = (
         (BEHIND, _is_behind(views, fit)),
@@ -312,9 +313,22 @@ def _fates(
         (FEW_FRAMES, agreeing < config.min_frames),
         (RESIDUAL, agreeing < config.min_inlier_share * number),
         (RESIDUAL, scale > config.max_noise_scale),
-        (UNCERTAIN, ~(sigma < torch.where(is_doubtful, doubtful, config.max_sigma_m))),
+        (UNCERTAIN, ~(sigma < config.max_sigma_m)),
     )
-    return _first_reason(tests)
+    fate = _first_reason(tests)
+    is_doubtful = agreeing < _least_views(agreeing[fate == KEPT], config.doubtful_frames)
+    fate[(fate == KEPT) & is_doubtful & ~(sigma < config.max_doubtful_sigma_m)] = UNCERTAIN
+    return fate
+
+
+def _least_views(number: Float[Tensor, " n"], most: int) -> float:
+    """So many views make a tracklet of a drive with such numbers no run of false detections, and `most` do anyway.
+
+    Half of those that half of its views come with: a slow camera, or one of few pixels, shows each sign a few times.
+    """
+    every, order = torch.cat((number, number.new_full((1,), 2.0 * most))).sort()
+    weight = torch.cat((number, number.new_full((1,), _VIEWS_BESIDE)))[order].cumsum(0)
+    return min(most, float(every[torch.searchsorted(weight, weight[-1:] / 2)]) / 2)
 
 
 def _fates_alone(

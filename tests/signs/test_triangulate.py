@@ -268,6 +268,32 @@ def test_a_sign_much_noisier_than_the_others_is_pruned(street):
     assert report.pruned["kept"] == len(ALL_SHAPES) - 1
 
 
+def test_signs_that_are_seen_a_few_times_each_are_mapped():
+    """As by a slow camera: less well placed than long tracklets, of which short runs are taken for false."""
+    places = [(3.5 * (-1) ** i, 60.0 + 25.0 * i, 2.5) for i in range(8)]
+    slow, fast = (
+        drive_past(
+            straight_poses(round(320 / step_m), step_m=step_m),
+            signs_at(places, yaw_deg=8.0),
+            noise_px=1.0,
+            depth_m=(20.0, 50.0),
+        )
+        for step_m in (8.0, 1.0)
+    )
+    signs, report = triangulate_signs(slow.journey, by_truth(slow), NOISE, CONFIG)
+    assert report.pruned["kept"] == len(places)
+    assert int(torch.bincount(slow.sign).max()) <= 4
+    sigma = torch.linalg.eigvalsh(signs.covariance)[:, -1].sqrt()
+    assert float(sigma.min()) > CONFIG.max_doubtful_sigma_m
+    assert float(corner_errors(signs, slow).mean()) < 1.0
+    # Beside signs that are seen thirty times the same four views are a short run.
+    run = (fast.sign != 3) | (fast.journey.signs.frame % 8 == 0)
+    short = with_rows(fast, run.nonzero()[:, 0])
+    _, report = triangulate_signs(short.journey, by_truth(short), NOISE, CONFIG)
+    assert REASONS[int(report.reason[3])] == "position too uncertain"
+    assert report.pruned["kept"] == len(places) - 1
+
+
 def test_a_standing_car_maps_nothing_new():
     """No parallax, no place: whatever was seen from one spot is pruned, and no error is raised."""
     drive = drive_past(straight_poses(1).expand(60, 4, 4), signs_at(ALONG_THE_ROAD), noise_px=0.5)
