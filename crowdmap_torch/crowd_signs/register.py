@@ -68,7 +68,7 @@ from crowdmap_torch.crowd_signs.outlier_journeys import (
     journey_statistics,
 )
 from crowdmap_torch.crowd_signs.rounds import CrowdRound, crowd_round
-from crowdmap_torch.crowd_signs.stretches import vote_by_stretch
+from crowdmap_torch.crowd_signs.stretches import first_biases
 from crowdmap_torch.crowd_signs.vote import VoteConfig
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.positioning import PositioningNoise
@@ -247,8 +247,8 @@ def _register_joint(
     generator: torch.Generator,
 ) -> Crowd:
     signs, journeys = crowd.signs, crowd.journeys
-    start = no_bias(signs, crowd.station, positioning, config.align, journeys=journeys)
-    bias = vote_by_stretch(crowd, start, positioning, config.vote, generator=generator)
+    found = first_biases(crowd, positioning, config.align, config.vote, generator=generator)
+    bias, crowd = found[0], replace(crowd, bias_sigma=found[1])
     weight = crowd.bias_sigma.new_ones(journeys)
     label = torch.full_like(signs.journey, -1)
     rounds: list[CrowdRound] = []

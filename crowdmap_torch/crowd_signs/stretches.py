@@ -1,4 +1,4 @@
-"""V-B, unlike the paper: first biases of long drives, other ones a few kilometres ahead, by a vote for every stretch."""
+"""V-B, unlike the paper: how large biases are, and the first ones, of long drives by a vote for every few kilometres."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import math
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from crowdmap_torch.crowd_signs.align import JourneyBias
+from crowdmap_torch.crowd_signs.align import AlignConfig, JourneyBias, no_bias
 from crowdmap_torch.crowd_signs.gather import CrowdSigns
 from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
 from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
@@ -15,6 +17,39 @@ from crowdmap_torch.noise.positioning import PositioningNoise
 
 _STRETCH = 1 / 10
 """Of the way on which a bias forgets where it was: the most that it is taken to stand still over."""
+_FREE = 3.0
+"""Biases are first looked for as if they were this many times as large as expected."""
+_FARTHER = 2.0
+"""... and shifts between drives this many times as far."""
+_LARGER = 1.5
+"""Where those found are larger than expected by this factor along any axis, they stand."""
+_MEDIAN = 0.6745
+"""Median of a standard normal deviate's magnitude."""
+
+
+def first_biases(
+    crowd: CrowdSigns,
+    positioning: PositioningNoise,
+    align: AlignConfig,
+    config: VoteConfig,
+    *,
+    generator: torch.Generator,
+) -> tuple[JourneyBias, Float[Tensor, "j 3"]]:
+    """The biases that `vote_by_stretch` finds, and 1-sigma of how large they may be, as wide as these are [m].
+
+    Shifts of many times what is expected lose the vote to wrong ones between neighbours: a drive is placed beside all
+    others, where its signs are nobody's or seem to be displaced. So a vote comes first that leaves biases free.
+    """
+    start = no_bias(crowd.signs, crowd.station, positioning, align, journeys=crowd.journeys)
+    same = torch.Generator().set_state(generator.get_state())
+    free = replace(crowd, bias_sigma=_FREE * crowd.bias_sigma)
+    far = replace(config, radius_m=_FARTHER * config.radius_m, height_m=_FARTHER * config.height_m)
+    found = vote_by_stretch(free, start, positioning, far, generator=same)
+    away = (found.translation - found.translation.median(0).values).abs() / crowd.bias_sigma
+    if bool((away.median(0).values > _LARGER * _MEDIAN).any()):
+        return found, free.bias_sigma
+    found = vote_by_stretch(crowd, start, positioning, config, generator=generator)
+    return found, crowd.bias_sigma
 
 
 def vote_by_stretch(

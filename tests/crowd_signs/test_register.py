@@ -33,6 +33,17 @@ def test_signs_on_a_post_are_told_apart(journeys: int, bias_m: float):
     assert scores.mean(0).min() > 0.98
 
 
+@pytest.mark.parametrize("seed", range(3, 6))
+def test_biases_of_many_times_what_is_expected_are_found(seed: int):
+    """Votes for the right shifts were too unlikely: recalls of 0.06, 0.12 and 0.11."""
+    world = make_world(seed, journeys=10, bias_m=2.0, length_m=500.0, posts=10)
+    expected = torch.full_like(world.crowd.bias_sigma, 0.6)
+    crowd = register_crowd(replace(world.crowd, bias_sigma=expected), NOISE, CrowdConfig())
+    precision, recall = pair_scores(world, crowd.label)
+    assert precision > 0.97 and recall > 0.95
+    assert not crowd.report.outlier_journeys
+
+
 def test_biases_are_found_with_the_signs():
     world = make_world(3, journeys=8)
     crowd = register_crowd(world.crowd, NOISE, CrowdConfig())
