@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,6 +42,12 @@ TRUSTED_SIGMAS = 3.0
 _ONE_VOTE = np.eye(len(polygon.SHAPES), dtype=np.int64)
 SURE_EPIPOLAR_COST = 5.0
 """Most that the epipolar cost can add where the tracklet is known well enough to be predicted."""
+_LARGE, _RARE = 4.64, 0.2
+"""A squared distance from its prediction that a fifth of all sightings exceeds (chi squared, three degrees of freedom)."""
+_STEP = 0.1
+"""Of the logarithm of the noise's variance, for one sighting."""
+_SLACK = 0.3
+"""So much of that logarithm is chance."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,17 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         self.positioning = positioning
         self.config = config
         self._pose_variance = positioning.white_sigma_m**2 + positioning.walk_m**2 / 2
+        self._log_noise = 0.0
+        """Logarithm of the noise's variance over what is expected, as sightings so far have it."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next step needs."""
+        return {**super().state_dict(), "log_noise": self._log_noise}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where another associator with the same configuration stopped."""
+        super().load_state_dict(state)
+        self._log_noise = state["log_noise"]
 
     def advance(
         self, features: SignFeatureArrays, rows: Int[np.ndarray, " m"], pair_costs: CostLookup
@@ -81,14 +99,18 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         silent_for = features.frame[rows[0]] - features.frame[old.last]
         if silent_for.max(initial=0) > self.config.window:
             old = old[silent_for <= self.config.window]
-        sighting, variance = features.sighting[rows], features.variance[rows]
+        noise = self._noise
+        sighting, variance = features.sighting[rows], noise * features.variance[rows]
         prediction = self._predict(old, features, int(rows[0]))
         epipolar_px2 = pair_costs(old.last[:, None], rows[None])
         if self.config.method == "paper2017":
             row, column = matching_of_near(epipolar_px2, self.config.paper.max_cost_px2)
         else:
-            cost = self._costs(old, features, rows, prediction, epipolar_px2)
+            innovation = depth_filter.innovation(prediction, sighting, variance)
+            cost = self._costs(old, features, rows, prediction, innovation, epipolar_px2)
             row, column = gated_matching(cost, self.config.unmatched_cost)
+            sure = old.votes[row].sum(-1) >= self.config.sure_after
+            self._learn(innovation.distance_sq[row[sure], column[sure]])
 
         label = self._labels(old, row, column, len(rows))
         shift = features.shift[rows]
@@ -127,6 +149,17 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         self._keep_last(features)
         return torch.from_numpy(label).to(device), torch.from_numpy(shift).to(device)
 
+    @property
+    def _noise(self) -> float:
+        """The variance of sightings as a multiple of what is expected, at least 1."""
+        return math.exp(max(self._log_noise - _SLACK, 0.0))
+
+    def _learn(self, distance_sq: Float[np.ndarray, " k"]) -> None:
+        """Follows the noise by how far sightings are from their predictions, such that few are far."""
+        for is_large in (distance_sq > _LARGE).tolist():
+            step = _STEP * (1 - _RARE if is_large else -_RARE)
+            self._log_noise = max(self._log_noise + step, 0.0)
+
     def _predict(
         self, old: ActiveSigns, features: SignFeatureArrays, now: int
     ) -> depth_filter.Prediction:
@@ -150,20 +183,18 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         features: SignFeatureArrays,
         rows: Int[np.ndarray, " m"],
         prediction: depth_filter.Prediction,
+        innovation: depth_filter.Innovation,
         epipolar_px2: Float[np.ndarray, "n m"],
     ) -> Float[np.ndarray, "n m"]:
         """Cost of continuing each tracklet with each detection."""
-        c = self.config
-        innovation = depth_filter.innovation(
-            prediction, features.sighting[rows], features.variance[rows]
-        )
+        c, noise = self.config, self._noise
         depth = prediction.depth[:, None]
         other_shape = old.votes.argmax(-1)[:, None] != features.shape[rows]
         refused = innovation.distance_sq > c.max_distance**2
         refused |= (depth < c.min_depth_m) | (depth > c.max_depth_m)
         # The poses' own noise moves the epipolar lines of near signs.
         pose_px2 = (features.focal[rows] / np.maximum(depth, c.min_depth_m)) ** 2
-        epipolar = epipolar_px2 / (c.sigma_px**2 + pose_px2 * self._pose_variance)
+        epipolar = epipolar_px2 / (noise * c.sigma_px**2 + pose_px2 * self._pose_variance)
         # A tracklet that is known well enough to be predicted may break the epipolar gate: its last measurement may
         # have been the wrong one.
         count = old.votes.sum(-1)[:, None]

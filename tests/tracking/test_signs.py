@@ -87,8 +87,24 @@ def test_signs_of_one_shape_on_one_post_stay_apart():
     assert_one_tracklet_each(associate_signs(journey, NOISE, CONFIG).label, drive.sign)
 
 
-def test_stepping_gives_exactly_the_batch():
-    drive = drive_past(straight_poses(50), signs_at(ALONG_THE_ROAD), shape=SHAPES, noise_px=0.6)
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_is_learnt_from_what_is_seen(seed: int):
+    """With what is usual 5 px broke twenty signs into more than a hundred tracklets."""
+    places = [(3.5 * (-1) ** i, 45.0 + 12.0 * i, 2.5) for i in range(20)]
+    drive = drive_past(straight_poses(280), signs_at(places), noise_px=5.0, seed=seed)
+    label = associate_signs(drive.journey, NOISE, CONFIG).label
+    long = torch.bincount(label)[label] >= 20
+    assert int(label.max()) < 40 and float(long.double().mean()) > 0.95
+    # Signs that are far away are a few pixels apart.
+    together = torch.bincount(20 * label + drive.sign, minlength=20 * (int(label.max()) + 1))
+    assert int(together.view(-1, 20).amax(1).sum()) > 0.97 * len(label)
+
+
+@pytest.mark.parametrize("noise_px", [0.6, 4.0])
+def test_stepping_gives_exactly_the_batch(noise_px: float):
+    drive = drive_past(
+        straight_poses(50), signs_at(ALONG_THE_ROAD), shape=SHAPES, noise_px=noise_px
+    )
     batch = associate_signs(drive.journey, NOISE, CONFIG)
     associator = SignAssociator(NOISE, CONFIG)
     for frame in range(drive.journey.frame_count):
@@ -109,8 +125,9 @@ def test_chunks_change_nothing():
     assert torch.equal(whole.label, pieces.label)
 
 
-def test_an_interrupted_drive_goes_on():
-    drive = drive_past(straight_poses(30), signs_at(ALONG_THE_ROAD), noise_px=0.6)
+@pytest.mark.parametrize("noise_px", [0.6, 4.0])
+def test_an_interrupted_drive_goes_on(noise_px: float):
+    drive = drive_past(straight_poses(30), signs_at(ALONG_THE_ROAD), noise_px=noise_px)
     signs, poses = drive.journey.signs, drive.journey.T_world_camera
     whole, resumed = SignAssociator(NOISE, CONFIG), SignAssociator(NOISE, CONFIG)
     for frame in range(30):
