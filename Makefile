@@ -9,6 +9,7 @@ AGAINST :=
 MUTANTS := 10000
 KILLS := 60
 SIGNALS := 10
+WORLDS := 60
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo bench test soak test-coverage lint format docs
@@ -36,10 +37,11 @@ bench: $(STAMP)  ## time and memory of each stage of the main job, 25 drives of 
 	$(BIN)/crowdmap benchmark stages $(BENCH) $(if $(AGAINST),--against $(AGAINST))
 
 # Two cores: half of the mutants each. What fails stays in soak-failures/.
-soak: $(STAMP)  ## ten thousand destroyed inputs, sixty kills, twenty signals: no traceback, no hang, nothing lost without a word
+soak: $(STAMP)  ## destroyed inputs, kills, signals, worlds at random: no traceback, no hang, nothing lost without a word
 	$(BIN)/python scripts/soak.py mutants --count $(MUTANTS) --processes 2
 	$(BIN)/python scripts/soak.py kills --count $(KILLS)
 	$(BIN)/python scripts/soak.py signals --count $(SIGNALS)
+	$(BIN)/python scripts/soak.py worlds --count $(WORLDS)
 
 # Each core has a process of its own, and files stay whole: their fixtures are made once. Annotations of shapes are checked.
 # Dozens of tests begin programs: with bytecode at hand, each of them begins half a second sooner.

@@ -17,6 +17,7 @@ STUDIES = {
     "mended": "map good data sets, the same with a mistake, and these put right",
     "mistakes": "make the usual mistakes on good data sets, and check and mend them",
     "signals": "interrupt runs at random instants, and resume them",
+    "worlds": "map roads, cameras, detectors and receivers of all kinds",
 }
 
 

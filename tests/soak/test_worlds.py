@@ -1,0 +1,85 @@
+"""Worlds at random: the same by number, all of them options that the simulator takes, and told by what their maps lack."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+from crowdmap_torch.commands import simulate
+from crowdmap_torch.soak import worlds
+
+FOUND = {
+    "signs": {
+        "observable": 8,
+        "recall": 1.0,
+        "precision": 1.0,
+        "relative": {"total": {"mean": 0.05}},
+    },
+    "uncertainty": {"coverage": 0.875},
+}
+
+
+def missing(recall: float, precision: float | None) -> dict:
+    signs = {**FOUND["signs"], "recall": recall, "precision": precision}
+    return {**FOUND, "signs": signs}
+
+
+def written(figures: dict | None):
+    """A command line that maps nothing, but writes these figures; None: it fails."""
+
+    def main(arguments: list[str]) -> int:
+        if arguments[0] == "optimize":
+            if figures is None:
+                return 1
+            run = Path(arguments[3])
+            run.mkdir(parents=True)
+            (run / "metrics.json").write_text(json.dumps({"survey": figures}))
+        return 0
+
+    return main
+
+
+def told(number: int) -> int:
+    return worlds.run(argparse.Namespace(first=number, count=1))
+
+
+def test_a_world_is_the_same_by_its_number():
+    assert worlds.drawn_world(7) == worlds.drawn_world(7) != worlds.drawn_world(8)
+
+
+def test_the_simulator_takes_every_world():
+    for number in range(200):
+        parser = argparse.ArgumentParser()
+        simulate.add_arguments(parser)
+        given = parser.parse_args(["data", *worlds.drawn_world(number)])
+        assert given.seed == number
+
+
+def test_a_good_map_is_a_line(monkeypatch, capsys):
+    monkeypatch.setattr(worlds, "main", written(FOUND))
+    assert told(13) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == [
+        "  13 highway  fisheye 3840 30 Hz     8  100 % 100 %  0.050 m   88 %"
+    ]
+
+
+@pytest.mark.parametrize(
+    "figures", [missing(0.5, 1.0), missing(0.0, None), missing(1.0, 0.7), None]
+)
+def test_of_a_map_that_lacks_signs_it_is_told_how_to_make_its_world(monkeypatch, capsys, figures):
+    monkeypatch.setattr(worlds, "main", written(figures))
+    assert told(13) == 1
+    assert (
+        capsys.readouterr()
+        .out.splitlines()[-1]
+        .startswith("     crowdmap simulate DATA --world highway")
+    )
+
+
+def test_a_world_without_signs_to_see_is_no_failure(monkeypatch):
+    none = {"observable": 0, "recall": None, "precision": None, "relative": None}
+    monkeypatch.setattr(worlds, "main", written({"signs": none, "uncertainty": None}))
+    assert told(53) == 0
