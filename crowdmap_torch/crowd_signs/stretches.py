@@ -22,7 +22,9 @@ _FREE = 3.0
 _FARTHER = 2.0
 """... and shifts between drives this many times as far."""
 _LARGER = 1.5
-"""Where those found are larger than expected by this factor along any axis, they stand."""
+"""Where those found are larger than expected by this factor along any axis, they stand ..."""
+_CHANCE = 4
+"""... and by more where drives are few: of so many, by twice as much."""
 _MEDIAN = 0.6745
 """Median of a standard normal deviate's magnitude."""
 
@@ -46,7 +48,8 @@ def first_biases(
     far = replace(config, radius_m=_FARTHER * config.radius_m, height_m=_FARTHER * config.height_m)
     found = vote_by_stretch(free, start, positioning, far, generator=same)
     away = (found.translation - found.translation.median(0).values).abs() / crowd.bias_sigma
-    if bool((away.median(0).values > _LARGER * _MEDIAN).any()):
+    least = _LARGER * (1 + _CHANCE / max(crowd.journeys, 1))
+    if bool((away.median(0).values > least * _MEDIAN).any()):
         return found, free.bias_sigma
     found = vote_by_stretch(crowd, start, positioning, config, generator=generator)
     return found, crowd.bias_sigma
