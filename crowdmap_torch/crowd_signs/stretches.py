@@ -14,6 +14,7 @@ from crowdmap_torch.crowd_signs.gather import CrowdSigns
 from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
 from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim.robust import median_scale
 
 _STRETCH = 1 / 10
 """Of the way on which a bias forgets where it was: the most that it is taken to stand still over."""
@@ -25,8 +26,6 @@ _LARGER = 1.5
 """Where those found are larger than expected by this factor along any axis, they stand ..."""
 _CHANCE = 4
 """... and by more where drives are few: of so many, by twice as much."""
-_MEDIAN = 0.6745
-"""Median of a standard normal deviate's magnitude."""
 
 
 def first_biases(
@@ -47,9 +46,9 @@ def first_biases(
     free = replace(crowd, bias_sigma=_FREE * crowd.bias_sigma)
     far = replace(config, radius_m=_FARTHER * config.radius_m, height_m=_FARTHER * config.height_m)
     found = vote_by_stretch(free, start, positioning, far, generator=same)
-    away = (found.translation - found.translation.median(0).values).abs() / crowd.bias_sigma
+    away = (found.translation - found.translation.median(0).values) / crowd.bias_sigma
     least = _LARGER * (1 + _CHANCE / max(crowd.journeys, 1))
-    if bool((away.median(0).values > least * _MEDIAN).any()):
+    if any(float(median_scale(axis)) > least for axis in away.unbind(1)):
         return found, free.bias_sigma
     found = vote_by_stretch(crowd, start, positioning, config, generator=generator)
     return found, crowd.bias_sigma

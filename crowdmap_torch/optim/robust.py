@@ -211,3 +211,12 @@ def median_scale(residual: Float[Tensor, " n"], *, floor: float = 0.0) -> Float[
     if not len(residual):
         return residual.new_tensor(floor)
     return (1.4826 * residual.abs().median()).clamp_min(floor)
+
+
+def usual(
+    value: Float[Tensor, " n"], weight: Float[Tensor, " n"], *, assumed: float, beside: float
+) -> float:
+    """Median of values by their weights, beside the weight of what is `assumed` where few values tell."""
+    every, order = torch.cat((value, value.new_full((1,), assumed))).sort()
+    below = torch.cat((weight, weight.new_full((1,), beside)))[order].cumsum(0)
+    return float(every[torch.searchsorted(below, below[-1:] / 2)])

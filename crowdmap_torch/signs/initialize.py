@@ -13,6 +13,7 @@ from crowdmap_torch.clustering.groups import group_median, group_sum
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.triangulation import midpoint_ragged
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim.robust import usual
 from crowdmap_torch.ranges import Angle, Count, Settings
 from crowdmap_torch.residuals.sign_prior import against_the_drive
 from crowdmap_torch.signs.fit import SignFitConfig, fit_signs_coarsely, robust_noise_scale
@@ -122,21 +123,6 @@ def starts(
     return found
 
 
-def choose_starts(
-    views: SignViews,
-    shape: Int[Tensor, " n"],
-    positioning: PositioningNoise,
-    config: SignStartConfig,
-    fit: SignFitConfig,
-    *,
-    size_limits: tuple[float, float],
-) -> tuple[SignStart, Float[Tensor, " n"]]:
-    """Signs fitted one by one from several starts, of each the best; and their noise scales."""
-    few = views[thinned(views, config.max_views)]
-    start, scale = _best_starts(few, shape, positioning, config, fit, size_limits)
-    return start, scale.clamp(1.0, fit.max_noise_scale)
-
-
 def choose_starts_of_drive(
     views: SignViews,
     shape: Int[Tensor, " n"],
@@ -146,40 +132,36 @@ def choose_starts_of_drive(
     *,
     size_limits: tuple[float, float],
 ) -> tuple[SignStart, Float[Tensor, " n"], SignFitConfig]:
-    """The same of all signs of a drive, and `fit` with corners as noisy as this drive's are, if that is more.
+    """`choose_starts` of all signs of a drive, and `fit` with corners as noisy as this drive's are, if that is more.
 
     Cameras of many pixels, and detectors that look at pictures made smaller, have a noise of their own: by a bound on what
-    is usual all of their signs would be pruned. The noise scales are multiples of the drive's.
+    is usual all of their signs would be pruned. The noise scales are multiples of the drive's, up to what `fit` admits.
     """
-    few = views[thinned(views, config.max_views)]
-    start, scale = _best_starts(few, shape, positioning, config, fit, size_limits)
+    seen = torch.bincount(views.sign, minlength=len(shape)).clamp_max(config.max_views)
+    start, scale = choose_starts(views, shape, positioning, config, fit, size_limits=size_limits)
     for _ in range(_ROUNDS - 1):
-        usual = _usual_scale(scale, few.sign)
-        if usual < _MUCH_NOISIER:
+        noisier = usual(scale, seen.to(scale), assumed=1.0, beside=_AS_ASSUMED)
+        if noisier < _MUCH_NOISIER:
             break
-        pixels = replace(fit.pixels, sigma_px=usual * fit.pixels.sigma_px)
+        pixels = replace(fit.pixels, sigma_px=noisier * fit.pixels.sigma_px)
         fit = replace(fit, pixels=pixels)
-        start, scale = _best_starts(few, shape, positioning, config, fit, size_limits)
-    return start, scale.clamp(1.0, fit.max_noise_scale), fit
+        start, scale = choose_starts(
+            views, shape, positioning, config, fit, size_limits=size_limits
+        )
+    return start, scale.clamp_max(fit.max_noise_scale), fit
 
 
-def _usual_scale(scale: Float[Tensor, " n"], sign: Int[Tensor, " m"]) -> float:
-    """Median of the noise scales over the views of a drive, and some that have what is assumed."""
-    weight = torch.bincount(sign, minlength=len(scale)).to(scale)
-    every, order = torch.cat((scale, scale.new_ones(1))).sort()
-    below = torch.cat((weight, weight.new_full((1,), _AS_ASSUMED)))[order].cumsum(0)
-    return float(every[torch.searchsorted(below, below[-1:] / 2)])
-
-
-def _best_starts(
-    few: SignViews,
+def choose_starts(
+    views: SignViews,
     shape: Int[Tensor, " n"],
     positioning: PositioningNoise,
     config: SignStartConfig,
     fit: SignFitConfig,
+    *,
     size_limits: tuple[float, float],
 ) -> tuple[SignStart, Float[Tensor, " n"]]:
-    """The best starts by a few views of each sign, and their noise scales, however large."""
+    """Signs fitted one by one from several starts, of each the best; and their noise scales, however large."""
+    few = views[thinned(views, config.max_views)]
     n, m = len(shape), len(few)
     centre = centre_points(few, n, typical_height_m=fit.habit.typical_size_m)
     facing = against_the_drive(few.T_world_camera, few.sign, n)
@@ -224,7 +206,7 @@ def choose_starts_again(
     )
     T, size = start.T_world_sign, start.size
     merged = SignStart(T.index_put((sign,), new.T_world_sign), size.index_put((sign,), new.size))
-    return merged, scale.index_put((sign,), new_scale)
+    return merged, scale.index_put((sign,), new_scale.clamp_max(fit.max_noise_scale))
 
 
 def _mean_ray(views: SignViews) -> Float[Tensor, "m 3"]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_argmin, group_mode, group_sum
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim.robust import usual
 from crowdmap_torch.ranges import (
     Count,
     Degrees,
@@ -326,9 +327,7 @@ def _least_views(number: Float[Tensor, " n"], most: int) -> float:
 
     Half of those that half of its views come with: a slow camera, or one of few pixels, shows each sign a few times.
     """
-    every, order = torch.cat((number, number.new_full((1,), 2.0 * most))).sort()
-    weight = torch.cat((number, number.new_full((1,), _VIEWS_BESIDE)))[order].cumsum(0)
-    return min(most, float(every[torch.searchsorted(weight, weight[-1:] / 2)]) / 2)
+    return min(most, usual(number, number, assumed=2.0 * most, beside=_VIEWS_BESIDE) / 2)
 
 
 def _fates_alone(

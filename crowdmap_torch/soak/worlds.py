@@ -24,7 +24,7 @@ from crowdmap_torch.cli import main
 _RECALL, _PRECISION = 0.95, 0.9
 """Least of the signs that can be seen, and of those of the map, that are to be found and right."""
 _SEED = 77
-_SIGMAS = {
+_DRAWN = {
     **dict.fromkeys(("--bias-e-m", "--bias-n-m", "--bias-u-m"), (0.2, 2.0)),
     "--drift-m": (0.1, 0.6),
     "--drift-length-m": (80, 400),
@@ -78,7 +78,7 @@ def drawn_world(number: int) -> list[str]:
     drawn += ["--outliers", str(_between(rng, 0.005, 0.08))]
     drawn += ["--missed", str(_between(rng, 0.02, 0.5))]
     drawn += ["--lane-noise-px", str(_between(rng, 0.5, 2.5) * width / 1280)]
-    for option, bounds in _SIGMAS.items():
+    for option, bounds in _DRAWN.items():
         drawn += [option, str(_between(rng, *bounds))]
     drawn += ["--shared-share", str(round(float(rng.uniform(0, 0.6)), 2))]
     if rng.random() < 0.3:

@@ -99,8 +99,7 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         silent_for = features.frame[rows[0]] - features.frame[old.last]
         if silent_for.max(initial=0) > self.config.window:
             old = old[silent_for <= self.config.window]
-        noise = self._noise
-        sighting, variance = features.sighting[rows], noise * features.variance[rows]
+        sighting, variance = features.sighting[rows], self._noise * features.variance[rows]
         prediction = self._predict(old, features, int(rows[0]))
         epipolar_px2 = pair_costs(old.last[:, None], rows[None])
         if self.config.method == "paper2017":
@@ -187,14 +186,14 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         epipolar_px2: Float[np.ndarray, "n m"],
     ) -> Float[np.ndarray, "n m"]:
         """Cost of continuing each tracklet with each detection."""
-        c, noise = self.config, self._noise
+        c = self.config
         depth = prediction.depth[:, None]
         other_shape = old.votes.argmax(-1)[:, None] != features.shape[rows]
         refused = innovation.distance_sq > c.max_distance**2
         refused |= (depth < c.min_depth_m) | (depth > c.max_depth_m)
         # The poses' own noise moves the epipolar lines of near signs.
         pose_px2 = (features.focal[rows] / np.maximum(depth, c.min_depth_m)) ** 2
-        epipolar = epipolar_px2 / (noise * c.sigma_px**2 + pose_px2 * self._pose_variance)
+        epipolar = epipolar_px2 / (self._noise * c.sigma_px**2 + pose_px2 * self._pose_variance)
         # A tracklet that is known well enough to be predicted may break the epipolar gate: its last measurement may
         # have been the wrong one.
         count = old.votes.sum(-1)[:, None]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.linearize import chunks, term_costs
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
-from crowdmap_torch.optim.robust import JointTukey, Tukey
+from crowdmap_torch.optim.robust import JointTukey, Tukey, usual
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 ROW_DIM = 2
@@ -130,3 +130,11 @@ def test_no_rows_are_no_trouble():
     loss = whole(LABEL[:0])
     nothing = torch.zeros(0, dtype=torch.float64)
     assert len(loss.rho(nothing)) == len(loss.weight(nothing)) == 0
+
+
+def test_what_is_usual_is_what_half_of_the_weight_says_or_what_is_assumed():
+    value = torch.tensor([5.0, 3.0, 4.0], dtype=torch.float64)
+    weight = torch.tensor([10.0, 10.0, 30.0], dtype=torch.float64)
+    assert usual(value, weight, assumed=1.0, beside=20.0) == 4.0
+    assert usual(value, weight, assumed=1.0, beside=60.0) == 1.0
+    assert usual(value[:0], weight[:0], assumed=1.0, beside=20.0) == 1.0
