@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
-from worlds.drives import with_frames, write_tiny
+from worlds.devices import FRAMES, assert_near, differences, first_frames, optimized, short
+from worlds.drives import write_tiny
 from worlds.pretend_device import DEVICE, PretendTensor, Transfers, pretend_device
 
-from crowdmap_torch import cli, mapper
+from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.evaluation.evaluate import against, evaluate_map, progress_scalars
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import read_map
@@ -26,18 +24,9 @@ from crowdmap_torch.io.truth import read_truth
 from crowdmap_torch.optim import band_cholesky
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.solvers import sparse_tiles, windows
+from crowdmap_torch.processes import sums
 from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of
 from crowdmap_torch.tables import Dataset, Journey, Lanes, Rows, Signs, to_device
-
-STEPS = 2
-CONFIG = f"adjust:\n  lm:\n    max_iterations: {STEPS}\n"
-
-
-def short() -> MapperConfig:
-    """The default configuration, with few steps of adjustment."""
-    config = MapperConfig()
-    lm = replace(config.adjust.lm, max_iterations=STEPS)
-    return replace(config, adjust=replace(config.adjust, lm=lm))
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +58,8 @@ def one_way_to_compute() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(band_cholesky, "_by_lapack", band_cholesky._by_blocks)
         patch.setattr(windows, "_in_place", lambda device: False)
+        patch.setattr(sums, "_sorts", lambda device: True)
+        patch.setattr(sums, "_MANY", 1)
         # Small ones, so that there are many.
         for name, width in (("_ONE_TILE", 100), ("_WIDTH", 64), ("_WIDTH_CUDA", 64)):
             patch.setattr(sparse_tiles, name, width)
@@ -82,8 +73,6 @@ def there(here: Dataset, transfers: Transfers) -> Dataset:
 
 Stages = tuple[tuple[mapper.JourneyMap, ...], mapper.FirstMap]
 FrameByFrame = tuple[Tensor, Signs | None, Lanes | None]
-FRAMES = 14
-"""Of a drive that is mapped frame by frame."""
 
 
 @pytest.fixture(scope="module")
@@ -107,14 +96,6 @@ def run_here(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
 def first(first_here: Stages, transfers: Transfers) -> Stages:
     """The same stages, moved there."""
     return to_device(first_here, DEVICE)
-
-
-def differences(a: Rows, b: Rows) -> Iterator[str]:
-    """Columns of two tables of which not every bit is the same."""
-    for f in fields(a):
-        one, other = getattr(a, f.name), getattr(b, f.name)
-        if isinstance(one, Tensor) and not torch.equal(one.cpu(), other.cpu()):
-            yield f.name
 
 
 def test_tensors_of_two_devices_do_not_meet(transfers: Transfers):
@@ -198,10 +179,6 @@ class AtOnce:
         return done
 
 
-def first_frames(dataset: Dataset) -> Journey:
-    return with_frames(dataset.journeys[0], torch.arange(FRAMES))
-
-
 def frame_by_frame(journey: Journey) -> FrameByFrame:
     """The tracklet of each sign detection as its frame came, and what the drive shows."""
     with pytest.MonkeyPatch.context() as patch:
@@ -220,16 +197,6 @@ def test_a_drive_is_mapped_frame_by_frame(here: Dataset, frames_here: FrameByFra
         assert list(differences(table, other)) == []
 
 
-def optimized(folder: Path, out: Path, device: str) -> tuple[Path, str]:
-    """A run of the main job on this device, and what it said."""
-    config, said = folder.parent / "short.yaml", io.StringIO()
-    config.write_text(CONFIG)
-    options = ["--config", str(config), "--device", device, "--workers", "1", "--log-every", "2"]
-    with contextlib.redirect_stdout(said):
-        assert cli.main(["optimize", str(folder), "--out", str(out), *options]) == 0
-    return out, said.getvalue()
-
-
 def test_optimize_makes_the_cpus_map_to_the_last_bit(
     folder: Path, tmp_path: Path, run_here: tuple[Path, str], transfers
 ):
@@ -243,3 +210,13 @@ def test_optimize_makes_the_cpus_map_to_the_last_bit(
     assert list(differences(here.signs, there.signs)) == []
     assert list(differences(here.lanes, there.lanes)) == []
     assert torch.equal(here.shared_covariance, there.shared_covariance)
+
+
+def test_journeys_are_mapped_by_processes_on_the_cpu_where_there_are_several(
+    folder: Path, tmp_path: Path, run_here: tuple[Path, str], transfers
+):
+    run, _ = optimized(folder, tmp_path / "run", "cuda:0", workers=2)
+    one, other = read_map(run_here[0] / "map"), read_map(run / "map")
+    # Those know nothing of the one way to compute: to rounding.
+    assert_near(one.signs, other.signs, within=1e-8)
+    assert_near(one.lanes, other.lanes, within=1e-8)

@@ -33,7 +33,7 @@ from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.robust import Huber, Tukey
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
-from crowdmap_torch.processes.threads import one_core_each
+from crowdmap_torch.processes.threads import one_core_each, repeatable
 from crowdmap_torch.ranges import Rounds, Workers, argument
 
 MINIMISATION = replace(
@@ -96,6 +96,8 @@ def solve(
     problem: FreeCorners, device: torch.device
 ) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:
     """Huber's stage, then Tukey's from its result; poses eliminated along their chains."""
+    # As the mapper does.
+    repeatable(device)
     start = time.perf_counter()
     # What a process loads at its first operations (threads, kernels) is set-up.
     tiny = free_corners.simulate(3, 12, 2)

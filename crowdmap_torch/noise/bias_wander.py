@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_range
+from crowdmap_torch.processes.sums import add_at
 
 LEAST_SHARE = 0.5
 """Drives that are as long as this share of the way on which their bias forgets where it was have one that wanders."""
@@ -139,8 +140,8 @@ def first_wander(
     cell = (way / (_START * length_m)).floor().long()
     _, of_node = torch.unique_consecutive(torch.stack((journey, cell)), dim=1, return_inverse=True)
     count = torch.bincount(of_node)[:, None]
-    mean = error.new_zeros(len(count), 3).index_add_(0, of_node, error) / count
-    centre = way.new_zeros(len(count)).index_add_(0, of_node, way) / count[:, 0]
+    mean = add_at(error.new_zeros(len(count), 3), 0, of_node, error) / count
+    centre = add_at(way.new_zeros(len(count)), 0, of_node, way) / count[:, 0]
     owner = torch.zeros_like(of_node[: len(count)]).index_copy_(0, of_node, journey)
     # Journeys one behind the other, far enough apart that no place lies between two of them.
     apart = way.max() + 2 * length_m if len(way) else 0.0
@@ -151,6 +152,6 @@ def first_wander(
     after = torch.where(owner[after] == journey, after, before)
     share = ((place - at[before]) / (at[after] - at[before]).clamp_min(1e-9)).clamp(0, 1)[:, None]
     smooth = torch.lerp(mean[before], mean[after], share)
-    total = smooth.new_zeros(len(wanders), 3).index_add_(0, journey, smooth)
+    total = add_at(smooth.new_zeros(len(wanders), 3), 0, journey, smooth)
     total = total / torch.bincount(journey, minlength=len(wanders)).clamp_min(1)[:, None]
     return (smooth - total[journey]) * wanders[journey, None]

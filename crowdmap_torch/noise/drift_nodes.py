@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from crowdmap_torch.processes.sums import add_at
+
 
 @dataclass(frozen=True)
 class DriftNodes:
@@ -32,7 +34,7 @@ class DriftNodes:
         """The mean over each journey's nodes; zero where it has none."""
         count = torch.bincount(self.journey, minlength=journeys).clamp_min(1)
         total = at_nodes.new_zeros(journeys, at_nodes.shape[1])
-        return total.index_add_(0, self.journey, at_nodes) / count[:, None]
+        return add_at(total, 0, self.journey, at_nodes) / count[:, None]
 
 
 def drift_nodes(journey: Int[Tensor, " n"], way: Float[Tensor, " n"], spacing: float) -> DriftNodes:
@@ -43,7 +45,7 @@ def drift_nodes(journey: Int[Tensor, " n"], way: Float[Tensor, " n"], spacing: f
     of_frame = begins.cumsum(0) - 1
     first = torch.nonzero(begins)[:, 0]
     count = torch.bincount(of_frame, minlength=len(first))
-    centre = way.new_zeros(len(first)).index_add_(0, of_frame, way) / count
+    centre = add_at(way.new_zeros(len(first)), 0, of_frame, way) / count
     return DriftNodes(of_frame, first, journey[first], centre, (way - centre[of_frame]).abs())
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.optim.robust import median_scale
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.ranges import Pixels, Settings, Sigma
 
 _CLASSES = 8
@@ -126,7 +127,7 @@ def shared_error(
     key = frame * (int(detection.max()) + 1) + detection
     _, group = torch.unique(key, return_inverse=True)
     count = torch.bincount(group)
-    total = residual.new_zeros(len(count)).index_add_(0, group, residual)
+    total = add_at(residual.new_zeros(len(count)), 0, group, residual)
     several = count > 1
     if not bool(several.any()):
         return residual.new_tensor(1.0)

@@ -16,6 +16,7 @@ from torch import Tensor
 from crowdmap_torch.noise.pooled_scales import MOST_SCALE
 from crowdmap_torch.noise.pose_prior import PosePrior
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges, MapEquations
+from crowdmap_torch.processes.sums import add_at
 
 _SAMPLED = 8
 """Changes of a journey whose variances are asked for, at most."""
@@ -110,7 +111,7 @@ def _by_journey(
     share: Float[Tensor, "q m"], journey: Int[Tensor, " q"], journeys: int
 ) -> Float[Tensor, "j m"]:
     """The mean of each journey's; zero where it has none."""
-    total = share.new_zeros(journeys, share.shape[1]).index_add_(0, journey, share)
+    total = add_at(share.new_zeros(journeys, share.shape[1]), 0, journey, share)
     return total / torch.bincount(journey, minlength=journeys).clamp_min(1)[:, None]
 
 
@@ -132,7 +133,7 @@ def white_scales(
     share = (1 - left / present).clamp(0, 1)
 
     def summed(of_each: Float[Tensor, "p 6"]) -> Float[Tensor, "j 2"]:
-        total = of_each.new_zeros(len(scale), 6).index_add_(0, journey, of_each)
+        total = add_at(of_each.new_zeros(len(scale), 6), 0, journey, of_each)
         return total.view(-1, 2, 3).sum(-1)
 
     grown = (summed(residual.square()) + _WHITE_TRUST) / (summed(share) + _WHITE_TRUST)

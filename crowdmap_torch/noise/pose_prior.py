@@ -30,6 +30,7 @@ from crowdmap_torch.noise.pooled_scales import pooled
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.noise.stated_sigmas import sigmas_of
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
 from crowdmap_torch.tables import Journey
@@ -320,7 +321,7 @@ class PosePrior:
         first, second = pair.unbind(1)
         own = self.nodes.journey[first]
         change = (at_nodes[second] - at_nodes[first]).square() / expected
-        total = at_nodes.new_zeros(journeys, at_nodes.shape[1]).index_add_(0, own, change)
+        total = add_at(at_nodes.new_zeros(journeys, at_nodes.shape[1]), 0, own, change)
         return total, torch.bincount(own, minlength=journeys).to(total)[:, None]
 
     def _share_of_mean(self, length_m: Float[Tensor, "j 3"]) -> Float[Tensor, "j 3"]:

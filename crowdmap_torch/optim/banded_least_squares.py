@@ -6,6 +6,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.band_cholesky import cholesky_banded
+from crowdmap_torch.processes.sums import add_at
 
 
 def solve_banded(
@@ -27,9 +28,9 @@ def solve_banded(
     for j in range(width):
         # Rows near the end may reach behind the last unknown with coefficients of zero.
         at = (start + j).clamp_max(count - 1)
-        rhs.index_add_(0, at, weighted[:, j, None] * target)
+        add_at(rhs, 0, at, weighted[:, j, None] * target)
         for i in range(j, width):
-            lower[:, i - j].index_add_(0, at, weighted[:, j] * row[:, i])
+            add_at(lower[:, i - j], 0, at, weighted[:, j] * row[:, i])
     factor = cholesky_banded(lower)
     if factor is None:
         raise ArithmeticError("an unknown is in no equation")

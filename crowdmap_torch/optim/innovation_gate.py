@@ -17,6 +17,7 @@ from torch import Tensor
 from crowdmap_torch.optim.linearize import chunks, row_blocks
 from crowdmap_torch.optim.problem import CostTerm, Values, Variable
 from crowdmap_torch.optim.robust import JointTukey, Quadratic
+from crowdmap_torch.processes.sums import add_at
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,9 @@ def innovations(
     for at, piece in chunks(replace(term, loss=Quadratic())):
         blocks = row_blocks(piece, variables, values)
         s[at] = blocks.rho
-        gradient.index_add_(0, run[at], blocks.gradient[0].mT)
-        matrix.index_add_(0, run[at], blocks.hessian[0, 0].flatten(0, 1).mT)
-    square = s.new_zeros(n).index_add_(0, run, s)
+        add_at(gradient, 0, run[at], blocks.gradient[0].mT)
+        add_at(matrix, 0, run[at], blocks.hessian[0, 0].flatten(0, 1).mT)
+    square = add_at(s.new_zeros(n), 0, run, s)
     first = count.cumsum(0) - count
     weight, block = loss.weight(s)[first], term.slots[0][1][first]
     matrix, gradient = matrix.view(n, k, k), gradient[..., None]

@@ -20,10 +20,12 @@ from crowdmap_torch.optim.problem import (
     Variable,
 )
 from crowdmap_torch.optim.robust import is_joint
+from crowdmap_torch.processes.amounts import at_once
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 CHUNK_ROWS = 1 << 13
-"""Rows that are linearised at once; bounds the memory, whatever the size of the problem."""
+"""Rows that are linearised at once on a CPU; bounds the memory, whatever the size of the problem."""
 
 
 def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
@@ -45,8 +47,12 @@ def _some_rows(constant: Float[Tensor, "m ..."], index: slice | Tensor) -> Float
     return constant[index]
 
 
-def chunks(term: CostTerm, size: int = CHUNK_ROWS) -> Iterator[tuple[slice, CostTerm]]:
-    """The term in pieces of at most `size` rows; those that are joined stay in one piece, however many they are."""
+def chunks(term: CostTerm, size: int | None = None) -> Iterator[tuple[slice, CostTerm]]:
+    """The term in pieces of at most `size` rows, by default as many as suit its device.
+
+    Rows that are joined stay in one piece, however many they are.
+    """
+    size = size or at_once(CHUNK_ROWS, term.slots[0][1].device)
     joint = term.loss if is_joint(term.loss) else term.shared
     start = 0
     while start < len(term):
@@ -107,11 +113,11 @@ class RowBlocks:
 
         def of_groups(x: Float[Tensor, "*block m"]) -> Float[Tensor, "*block groups"]:
             flat = x.reshape(-1, x.shape[-1])
-            total = flat.new_zeros(len(flat), count).index_add_(1, group, flat)
+            total = add_at(flat.new_zeros(len(flat), count), 1, group, flat)
             return total.view(*x.shape[:-1], count)
 
         return RowBlocks(
-            self.rho.new_zeros(count).index_add_(0, group, self.rho),
+            add_at(self.rho.new_zeros(count), 0, group, self.rho),
             tuple(map(of_groups, self.gradient)),
             {slots: of_groups(block) for slots, block in self.hessian.items()},
         )
@@ -306,7 +312,7 @@ def _scale(weight: Float[Tensor, " m"] | Float[Tensor, "m d"]) -> Float[Tensor, 
 
 
 def term_costs(
-    problem: Problem, values: Values, *, chunk_rows: int = CHUNK_ROWS
+    problem: Problem, values: Values, *, chunk_rows: int | None = None
 ) -> dict[str, Float[Tensor, " groups"]]:
     """`1/2 sum rho` of every term, for each of the independent problems; of terms that others have as well."""
     first = next(iter(values.values()))
@@ -325,4 +331,4 @@ def _losses(problem: Problem, piece: CostTerm, values: Values) -> Float[Tensor, 
     group = problem.group_of_rows(piece)
     if group is None:
         return rho.sum()[None]
-    return rho.new_zeros(problem.group_count).index_add_(0, group, rho)
+    return add_at(rho.new_zeros(problem.group_count), 0, group, rho)

@@ -13,6 +13,7 @@ from scipy.special import gammainc
 from torch import Tensor
 
 from crowdmap_torch.optim.shared_errors import cut_between_runs
+from crowdmap_torch.processes.sums import add_at
 
 _EFFICIENCY = 0.95
 """Of Tukey's weights at normal residuals with the usual c of 4.685 (Holland and Welsch 1977)."""
@@ -176,7 +177,7 @@ class JointTukey:
         own = self.run - self.run[0]
         # As many as there are rows are enough: how many there are is not asked for, which would stop a GPU.
         total = torch.zeros_like(s)
-        return total.index_add_(0, own, s)[own]
+        return add_at(total, 0, own, s)[own]
 
 
 @lru_cache(maxsize=64)

@@ -17,8 +17,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, RowBlocks, chunks, row_gradients, rows
+from crowdmap_torch.optim.linearize import RowBlocks, chunks, row_gradients, rows
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 _Linearize = Callable[[CostTerm, Mapping[str, Variable], Values], RowBlocks]
@@ -72,7 +73,7 @@ def assemble(
     add: Callable[[TermRows], None],
     *,
     groups: Mapping[str, RowGroups] | None = None,
-    chunk_rows: int = CHUNK_ROWS,
+    chunk_rows: int | None = None,
 ) -> Costs:
     """The cost of every term; `add` is handed all rows, chunk by chunk, as `linearize` gives them.
 
@@ -98,7 +99,7 @@ def assemble(
             if group is None:
                 cost += rho.sum() / 2
             else:
-                cost.index_add_(0, group, rho / 2)
+                add_at(cost, 0, group, rho / 2)
             add(chunk)
         by_term[name] = cost
     return Costs(torch.stack(list(by_term.values())).sum(0), by_term)
@@ -113,7 +114,7 @@ def cost_and_gradient(problem: Problem, values: Values) -> tuple[Costs, dict[str
 
     def add(chunk: TermRows) -> None:
         for (name, block), pull in zip(chunk.slots, chunk.blocks.gradient, strict=True):
-            gradient[name].index_add_(1, block, pull)
+            add_at(gradient[name], 1, block, pull)
 
     costs = assemble(problem, values, row_gradients, add)
     found = {name: of.mT.contiguous() for name, of in gradient.items()}
@@ -158,10 +159,10 @@ class BlockDiagonal:
     def add(self, chunk: TermRows) -> None:
         """Adds the rows' gradients and diagonal blocks."""
         for i, (name, block) in enumerate(chunk.slots):
-            self._gradient[name].index_add_(1, block, chunk.blocks.gradient[i])
+            add_at(self._gradient[name], 1, block, chunk.blocks.gradient[i])
             # The blocks are symmetric.
             for row, entries in enumerate(chunk.blocks.hessian[i, i]):
-                self._square[name][row, row:].index_add_(1, block, entries[row:])
+                add_at(self._square[name][row, row:], 1, block, entries[row:])
 
     def gradient(self, name: str) -> Float[Tensor, "n k"]:
         """The gradient of a variable."""
@@ -185,4 +186,4 @@ def add_blocks(
     down = torch.arange(height, device=row.device)[:, None, None]
     right = torch.arange(width, device=row.device)[:, None]
     at = (row + down) * stride + (column + right)
-    matrix.index_add_(0, at.flatten(), block.flatten())
+    add_at(matrix, 0, at.flatten(), block.flatten())

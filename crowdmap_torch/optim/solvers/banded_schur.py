@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.band_cholesky import BandFactor, BandInverse, cholesky_banded
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
+from crowdmap_torch.optim.linearize import row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, TermRows, add_blocks, assemble
 from crowdmap_torch.optim.solvers.normal_equations import (
@@ -31,6 +31,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
     failed_step,
     solved_step,
 )
+from crowdmap_torch.processes.sums import add_at
 
 UNHELD_FLOOR = 1e-6
 """Information added to every unknown before its covariance is read: none is less sure than 1000 units."""
@@ -46,7 +47,7 @@ class BandBackend:
     """
 
     path: str
-    chunk_rows: int = CHUNK_ROWS
+    chunk_rows: int | None = None
 
     def assemble(self, problem: Problem, values: Values) -> BandNormalEquations:
         """Normal equations at `values`."""
@@ -235,7 +236,7 @@ class BandNormalEquations:
 
     def _reduced_gradient(self, reduced: _Reduced) -> Float[Tensor, " q"]:
         own = (self.coupling.mT @ (reduced.inverse @ self.own_gradient[..., None]))[..., 0]
-        return self.path_gradient.index_add(0, self.columns().flatten(), -own.flatten())
+        return add_at(self.path_gradient.clone(), 0, self.columns().flatten(), -own.flatten())
 
     def _reduced(self, own_added: Tensor, path_added: Tensor) -> _Reduced | None:
         """The factor of the path's band once landmarks are eliminated; None where there is none."""

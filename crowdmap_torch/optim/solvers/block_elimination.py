@@ -18,6 +18,8 @@ from torch import Tensor
 
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
 from crowdmap_torch.optim.solvers.windows import Batch, Product, Round
+from crowdmap_torch.processes.amounts import at_once
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 
@@ -62,7 +64,7 @@ def fill_chain(
     neighbour, k = of_round.neighbour, diagonal.shape[-1]
     e, sides = neighbour.shape
     own = square.view(e, sides, k, sides, k).diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
-    diagonal.view(-1, k * k).index_add_(0, neighbour.flatten(), own.reshape(-1, k * k))
+    add_at(diagonal.view(-1, k * k), 0, neighbour.flatten(), own.reshape(-1, k * k))
     if sides == 2:
         link[neighbour[:, 0]] = square[:, :k, k:]
 
@@ -92,7 +94,7 @@ def solve_rounds(
             whitened = lead.whiten[some] @ rest[own]
             rest[own] = whitened
             fill = _turned(lead.towards[some], whitened).view(-1, *rest.shape[1:])
-            rest.index_add_(0, of_round.neighbour[some].flatten() - gone, fill)
+            add_at(rest, 0, of_round.neighbour[some].flatten() - gone, fill)
     # Back in the same memory: neighbours went later, and the last place is nobody's.
     rest[-1] = 0
     for of_round, lead in zip(reversed(rounds), reversed(leads), strict=True):
@@ -105,9 +107,9 @@ def solve_rounds(
 def _by_lots(
     of_round: Round, gone: int, rest: Float[Tensor, "p k c"]
 ) -> Iterator[tuple[slice, slice]]:
-    """The blocks of a round and their places in `rest`, as many at once as a processor's cache holds."""
+    """The blocks of a round and their places in `rest`, as many at once as suit the device."""
     first, count = of_round.place.start - gone, of_round.place.stop - of_round.place.start
-    size = max(1, _LOT // max(rest[:1].numel(), 1))
+    size = max(1, at_once(_LOT, rest.device) // max(rest[:1].numel(), 1))
     for begin in range(0, count, size):
         end = min(begin + size, count)
         yield slice(begin, end), slice(first + begin, first + end)

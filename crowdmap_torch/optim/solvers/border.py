@@ -23,6 +23,8 @@ from crowdmap_torch.optim.solvers.block_elimination import Lead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.processes.amounts import at_once
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 
@@ -76,10 +78,10 @@ class ChainBorder:
             at = pattern.at(found.row[:, None, None], entry)
             # Not all that a part is coupled to has to do with all of its chains.
             at = torch.where(at < 0, forgotten, at)
-            system.flat.index_add_(0, at.flatten(), found.by_landmark.flatten(), alpha=-1)
+            add_at(system.flat, 0, at.flatten(), found.by_landmark.flatten(), alpha=-1)
             at = pattern.at(entry[:, :, None], entry[:, None])
-            system.flat.index_add_(0, at.flatten(), found.by_chain.flatten(), alpha=-1)
-            system.right_side.index_add_(0, entry.flatten(), found.own.flatten(), alpha=-1)
+            add_at(system.flat, 0, at.flatten(), found.by_chain.flatten(), alpha=-1)
+            add_at(system.right_side, 0, entry.flatten(), found.own.flatten(), alpha=-1)
 
     def through(
         self,
@@ -100,10 +102,11 @@ class ChainBorder:
         row, by_landmark = self._couple(part, x, column, columns)
         by_chain = x.new_zeros(len(chain), self.link.shape[-1], c)
         own = x.new_zeros(len(chain), c, beside.shape[-1])
-        for some in torch.arange(len(of), device=of.device).split(CHUNK_ROWS):
+        lot = at_once(CHUNK_ROWS, of.device)
+        for some in torch.arange(len(of), device=of.device).split(lot):
             of_some = x[part.place[some]]
-            by_chain.index_add_(0, of[some], self.link[part.block[some]].mT @ of_some)
-            own.index_add_(0, of[some], of_some.mT @ beside[some])
+            add_at(by_chain, 0, of[some], self.link[part.block[some]].mT @ of_some)
+            add_at(own, 0, of[some], of_some.mT @ beside[some])
         return Through(row, by_landmark, chain, by_chain, own)
 
     def _couple(
@@ -114,14 +117,15 @@ class ChainBorder:
         each = [structure.couplings.factors[name].column[own] for name, own in part.factors.items()]
         row = torch.unique(torch.cat([column.new_zeros(0), *(at.flatten() for at in each)]))
         total = x.new_zeros(len(row) * columns, x.shape[-1])
+        lot = at_once(CHUNK_ROWS, x.device)
         for (name, own), at in zip(part.factors.items(), each, strict=True):
             block, factors = self.coupling[name][own], structure.couplings.factors[name].block[own]
-            for begin in range(0, len(at), CHUNK_ROWS):
-                some = slice(begin, begin + CHUNK_ROWS)
+            for begin in range(0, len(at), lot):
+                some = slice(begin, begin + lot)
                 of = structure.number[factors[some]]
                 entry = torch.searchsorted(row, at[some]) * columns + column[of][:, None]
                 product = block[some] @ x[part.place[of], : block.shape[2]]
-                total.index_add_(0, entry.flatten(), product.flatten(0, 1))
+                add_at(total, 0, entry.flatten(), product.flatten(0, 1))
         return row, total.view(-1, columns, x.shape[-1])
 
 
@@ -140,7 +144,7 @@ class WeightedSums:
         here = torch.nonzero((self.of >= begin) & (self.of < end))[:, 0]
         total = self.value.new_zeros(dim * (end - begin), self.value.shape[1])
         at = self.row[here] * (end - begin) + self.of[here] - begin
-        return total.index_add_(0, at, self.value[here]).view(dim, end - begin, -1)
+        return add_at(total, 0, at, self.value[here]).view(dim, end - begin, -1)
 
 
 def weighted_sums(
@@ -163,7 +167,7 @@ def weighted_sums(
 
     row, of_sum, value = [], [], []
     for found, seen in in_order(of_part, every, weight.device, worth=1):
-        own.index_add_(0, of[found.chain], found.own)
+        add_at(own, 0, of[found.chain], found.own)
         entry = structure.border[found.chain]
         for rows, columns, of_each in (
             (found.row[:, None], seen, found.by_landmark),

@@ -28,7 +28,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
+from crowdmap_torch.optim.linearize import row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, assemble
 from crowdmap_torch.optim.solvers.block_elimination import (
@@ -63,6 +63,7 @@ from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.optim.solvers.windows import Batch, Round
 from crowdmap_torch.optim.solvers.workspace import Factor, Workspace
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 _NEXT_TO_NOTHING = 1e-6
@@ -82,9 +83,9 @@ class ChainBackend:
     plan: EliminationPlan
     group_size: int | None = None
     """Blocks that share one window of columns; None: as many as there are chains, from 4 to 64."""
-    batch_bytes: int = 1 << 22
-    """Size of what is computed at once: about what the processor's cache holds."""
-    chunk_rows: int = CHUNK_ROWS
+    batch_bytes: int | None = None
+    """Size of what is computed at once; None: what suits the device."""
+    chunk_rows: int | None = None
     _pattern: SparsityPattern | None = field(default=None, repr=False)
     _structure: ChainStructure | None = field(default=None, repr=False)
     _workspace: Workspace | None = field(default=None, repr=False)
@@ -303,9 +304,9 @@ class ChainNormalEquations:
 
             done = in_order(eliminated, of_round.batches, store.device)
             for batch, found in zip(of_round.batches, done, strict=True):
-                store.index_add_(0, batch.fill.flatten(), found.fill)
+                add_at(store, 0, batch.fill.flatten(), found.fill)
                 if found.scattered is not None:
-                    system.flat.index_add_(0, *found.scattered)
+                    add_at(system.flat, 0, *found.scattered)
                 elif batch.products is not None:
                     products.add(batch.products, found.wide)
         return tuple(leads)
@@ -319,7 +320,7 @@ class ChainNormalEquations:
             if name in part.alone:
                 narrow.index_copy_(0, rows, block)
             else:
-                narrow.index_add_(0, rows, block)
+                add_at(narrow, 0, rows, block)
         store[part.right_side_row] = self.eliminated_gradient[part.block]
         return store
 
@@ -343,10 +344,10 @@ class ChainNormalEquations:
         for name, block in self.coupling.items():
             coupling = structure.couplings.factors[name]
             product = block @ x.index_select(0, coupling.block)[:, : block.shape[2], None]
-            total.index_add_(0, coupling.column.flatten(), product.flatten())
+            add_at(total, 0, coupling.column.flatten(), product.flatten())
         told = (self.border_link.mT @ x[..., None])[..., 0]
-        by_chain = told.new_zeros(structure.border.shape).index_add_(0, structure.owner, told)
-        return total.index_add_(0, structure.border.flatten(), by_chain.flatten())
+        by_chain = add_at(told.new_zeros(structure.border.shape), 0, structure.owner, told)
+        return add_at(total, 0, structure.border.flatten(), by_chain.flatten())
 
     def couple_back(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
         """B^T y."""
@@ -355,7 +356,7 @@ class ChainNormalEquations:
             coupling = self.structure.couplings.factors[name]
             of_factor = y.index_select(0, coupling.column.flatten()).view(coupling.column.shape)
             product = (of_factor[:, None] @ block)[:, 0]
-            total[:, : product.shape[1]].index_add_(0, coupling.block, product)
+            add_at(total[:, : product.shape[1]], 0, coupling.block, product)
         return total
 
     def substitute(

@@ -13,6 +13,7 @@ from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, pairs
 from crowdmap_torch.optim.solvers.couplings import TermFactors
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, padded
 from crowdmap_torch.optim.solvers.staying_blocks import Between, StayingBlocks
+from crowdmap_torch.processes.sums import add_at
 
 
 class ChainSums:
@@ -43,10 +44,10 @@ class ChainSums:
                 self._add_link(here, there, padded(square, 2, self._k))
             elif name in first and other in self.border:
                 beside = padded(chunk.blocks.hessian[i, j].permute(2, 0, 1), 1, self._k)
-                self.border[other].index_add_(0, block + first[name], beside)
+                add_at(self.border[other], 0, block + first[name], beside)
             elif name in self.border and other in first:
                 beside = padded(chunk.blocks.hessian[i, j].permute(2, 1, 0), 1, self._k)
-                self.border[name].index_add_(0, block_of_other + first[other], beside)
+                add_at(self.border[name], 0, block_of_other + first[other], beside)
 
     def diagonal(self) -> Float[Tensor, "e k k"]:
         """Diagonal blocks of A, counted over leaves and chains."""
@@ -80,7 +81,7 @@ class ChainSums:
                 "a term links two eliminated blocks that are neither neighbours in their chain "
                 "nor a leaf and the block that carries it"
             )
-        self.link.index_add_(0, low, torch.where((here < there)[:, None, None], block, block.mT))
+        add_at(self.link, 0, low, torch.where((here < there)[:, None, None], block, block.mT))
 
 
 class ReducibleSums(ChainSums):
@@ -121,7 +122,7 @@ class ReducibleSums(ChainSums):
                 size = (*square.shape[:2], len(term.slots[0][1]))
                 self._lots[key] = square.new_zeros(size)
             into = self._lots[key].flatten(0, 1)
-            into.index_add_(1, term.lot[chunk.at], square.flatten(0, 1))
+            add_at(into, 1, term.lot[chunk.at], square.flatten(0, 1))
         if term is not None:
             into = self.coupling[term.coupling]
             _add_coupling(into, term, chunk, self.structure.landmarks.first)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, row_blocks
+from crowdmap_torch.optim.linearize import row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import TermRows, add_blocks, assemble
 from crowdmap_torch.optim.solvers.layout import Layout, layout, read_entries
@@ -30,7 +30,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 class DenseBackend:
     """One dense matrix per independent problem: for problems of tens of unknowns, thousands at a time."""
 
-    chunk_rows: int = CHUNK_ROWS
+    chunk_rows: int | None = None
 
     def assemble(self, problem: Problem, values: Values) -> DenseNormalEquations:
         """Normal equations at `values`, [groups, dim, dim] and [groups, dim]."""

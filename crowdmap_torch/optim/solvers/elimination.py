@@ -39,8 +39,11 @@ from crowdmap_torch.optim.solvers.tile_patterns import (
     tiles_of_factor,
 )
 from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, WindowBuilder
+from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.threads import in_order
 
+_BATCH_BYTES = 1 << 22
+"""Size of what is eliminated at once on a CPU: about what its cache holds."""
 _SPARSER = 0.8
 """Share of the tiles of an order by dissection that a band is to have less than, if it is taken."""
 
@@ -138,7 +141,7 @@ def analyse(
     plan: EliminationPlan,
     *,
     group_size: int | None,
-    batch_bytes: int,
+    batch_bytes: int | None,
     before: ChainStructure | None = None,
 ) -> ChainStructure:
     """The elimination of a plan's leaves and chains in a problem; that of `before` where it is the same.
@@ -163,6 +166,7 @@ def analyse(
         raise ValueError(f"{plan.leaves!r}: expected leaves of at most {k} tangents, the chains'")
     owner = plan.owner
     size = group_size or min(64, max(4, _beside_each_other(keys, owner, landmarks.count)))
+    batch_bytes = batch_bytes or at_once(_BATCH_BYTES, owner.device)
     builders, number = _builders(plan, keys, landmarks, size, k, batch_bytes)
     beside = border_beside(keys, landmarks.count, owner, plan.border)
     by_rows = [of for of in beside if of.variable in seen_with]

@@ -28,6 +28,7 @@ from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 
@@ -147,7 +148,7 @@ def joints_of(
         # Few blocks touch a joint.
         ends = torch.nonzero(E.flatten(1).any(1))[:, 0]
         taken = like.new_zeros(chains, 2 * width, 2 * width)
-        taken.index_add_(0, structure.owner[part.block[ends]], E[ends].mT @ U[ends])
+        add_at(taken, 0, structure.owner[part.block[ends]], E[ends].mT @ U[ends])
         return U, taken
 
     goes_with = like.new_empty(len(structure.owner), structure.width[plan.chains], 2 * width)
@@ -170,7 +171,7 @@ def joints_of(
     diagonal = hessian.own[plan.joints][used]
     for end in range(2):
         own, side = torch.nonzero(known[:, end])[:, 0], slice(end * width, (end + 1) * width)
-        diagonal.index_add_(0, joint[own, end], -taken[own, side, side])
+        add_at(diagonal, 0, joint[own, end], -taken[own, side, side])
     link = torch.zeros_like(diagonal)
     link[joint[inner, 0]] = -taken[inner, :width, width:]
     return Joints(goes_with, structure.owner, joint, JointChain.of(diagonal, link, follows))

@@ -43,6 +43,7 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.together import Together
 
 
@@ -86,9 +87,9 @@ class JourneySystem:
         begin = pattern.base[: pattern.tiles, : pattern.tiles].flatten()[of_row]
         assert bool((begin >= 0).all()), "the sum has the tiles of its summands"
         entry = self.entry.long()
-        system.flat.index_add_(0, begin[entry // area] + entry % area, self.information)
+        add_at(system.flat, 0, begin[entry // area] + entry % area, self.information)
         padded = system.flat[pattern.count * area :][: pattern.tiles * pattern.width]
-        padded.view(-1, pattern.width).index_add_(0, self.row, self.right_side)
+        add_at(padded.view(-1, pattern.width), 0, self.row, self.right_side)
 
 
 @dataclass

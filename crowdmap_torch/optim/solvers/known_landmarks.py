@@ -21,6 +21,7 @@ from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
 from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
+from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 _AT_ONCE = 1 << 13
@@ -142,7 +143,7 @@ class KnownLandmarks:
             return (sign * of * found).sum(1)
 
         for (*_, here), found in zip(every, in_order(solved, every, of.device), strict=True):
-            variance.index_add_(0, row[here], found)
+            add_at(variance, 0, row[here], found)
         if self.joints is not None:
             variance += self.joints.of_changes(changes, leaves)
         return variance

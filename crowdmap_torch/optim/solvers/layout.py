@@ -11,6 +11,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, Tangents
+from crowdmap_torch.processes.sums import add_at
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def in_sections(
     begins = width.cumsum(0) - width
     if section is not None and len(section):
         _, of, count = torch.unique_consecutive(section, return_inverse=True, return_counts=True)
-        size = torch.zeros_like(count).index_add_(0, of, width)
+        size = add_at(torch.zeros_like(count), 0, of, width)
         room = -(-size // grid) * grid
         room[-1] = size[-1]
         begins = begins + ((room - size).cumsum(0) - (room - size))[of]

@@ -24,6 +24,7 @@ from crowdmap_torch.optim.solvers.dissection import incidence
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern
 from crowdmap_torch.optim.solvers.windows import Round, WindowBuilder
+from crowdmap_torch.processes.sums import add_at
 
 _IN_COMMON = 0.5
 """Share of a chain's landmarks that it has in common with the first of a part, at least."""
@@ -218,7 +219,7 @@ def _alone(rows: Mapping[str, Int[Tensor, " fw"]], size: int) -> frozenset[str]:
     for name, of_term in rows.items():
         if taken is None:
             taken = torch.zeros(size, dtype=torch.long, device=of_term.device)
-        taken.index_add_(0, of_term, torch.ones_like(of_term))
+        add_at(taken, 0, of_term, torch.ones_like(of_term))
         if bool((taken[of_term] == 1).all()):
             alone.add(name)
     return frozenset(alone)

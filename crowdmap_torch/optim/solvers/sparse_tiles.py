@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from crowdmap_torch.processes.sums import add_at
+
 _ONE_TILE = 768
 """Unknowns up to which one tile holds everything."""
 _WIDTH = 96
@@ -180,7 +182,7 @@ class TileMatrix:
         padded = added.new_ones(self.pattern.tiles * w)
         padded[: self.pattern.dim] = added
         entry = torch.arange(w, device=added.device) * (w + 1)
-        self.flat.index_add_(0, (number[:, None] * w * w + entry).flatten(), padded)
+        add_at(self.flat, 0, (number[:, None] * w * w + entry).flatten(), padded)
 
     def add(
         self, row: Int[Tensor, " m"], column: Int[Tensor, " m"], block: Float[Tensor, "k l m"]
@@ -189,9 +191,7 @@ class TileMatrix:
         height, width, _ = block.shape
         down = torch.arange(height, device=row.device)[:, None, None]
         right = torch.arange(width, device=row.device)[:, None]
-        self.flat.index_add_(
-            0, self.pattern.at(row + down, column + right).flatten(), block.flatten()
-        )
+        add_at(self.flat, 0, self.pattern.at(row + down, column + right).flatten(), block.flatten())
 
     def read(self, row: Int[Tensor, ...], column: Int[Tensor, ...]) -> Float[Tensor, ...]:
         """Entries, rows and columns broadcast; ValueError where there is no tile."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.solvers.layout import Layout
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.processes.sums import add_at
 
 
 class Between(NamedTuple):
@@ -29,7 +30,7 @@ class Between(NamedTuple):
         if len(at) == len(key):
             return self
         total = self.square.new_zeros(*self.square.shape[:2], len(at))
-        total.index_add_(2, of, self.square)
+        add_at(total, 2, of, self.square)
         return Between(at // dim, at % dim, total)
 
 
@@ -51,7 +52,7 @@ class StayingBlocks:
             twice = torch.nonzero(row == column)[:, 0]
             of_twice = square[..., twice].diagonal()
             at = row[twice, None] + torch.arange(of_twice.shape[1], device=row.device)
-            total.index_add_(0, at.flatten(), 2 * of_twice.flatten())
+            add_at(total, 0, at.flatten(), 2 * of_twice.flatten())
         return total
 
     def add_to(self, system: TileMatrix) -> None:

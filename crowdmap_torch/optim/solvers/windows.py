@@ -21,6 +21,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.solvers.layout import Layout
 from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern
+from crowdmap_torch.processes.sums import add_at
 
 _WORTH_RUNS = 160
 """Width from which a window's products are worth a call for each pair of its runs."""
@@ -171,7 +172,7 @@ class WindowBuilder:
         place[node] = torch.arange(len(node), device=device)
         block, landmark = place[keys // count], keys % count
         width = torch.zeros(len(node), dtype=torch.double, device=device)
-        width.index_add_(0, block, self.landmarks.width[landmark].double())
+        add_at(width, 0, block, self.landmarks.width[landmark].double())
         first = torch.full((len(node),), self.landmarks.dim, device=device)
         first.scatter_reduce_(0, block, self.landmarks.column[landmark], "amin")
         table, group = self._groups(node, first, width)
@@ -182,7 +183,7 @@ class WindowBuilder:
         each = self.landmarks.width[landmark]
         # The gradient is every window's first column.
         start = each.cumsum(0) - each
-        total = torch.zeros(group_count, dtype=torch.long, device=device).index_add_(0, of, each)
+        total = add_at(torch.zeros(group_count, dtype=torch.long, device=device), 0, of, each)
         start = start - (total.cumsum(0) - total)[of] + 1
         self.window_keys.append(self.groups * count + window)
         self.window_places.append(start)
@@ -190,7 +191,7 @@ class WindowBuilder:
         breaks = torch.ones_like(window, dtype=torch.bool)
         breaks[1:] = window[1:] != window[:-1] + 1
         breaks[1:] |= of[1:] != of[:-1]
-        runs = torch.zeros_like(total).index_add_(0, of, breaks.long())
+        runs = add_at(torch.zeros_like(total), 0, of, breaks.long())
         in_runs = (total >= _WORTH_RUNS) & (total >= _RUN * runs) & self.in_place
         batches = []
         for kind in torch.unique(2 * padded + in_runs).tolist():
