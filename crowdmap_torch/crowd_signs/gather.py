@@ -12,6 +12,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import distinct_pairs, pairs_within
 from crowdmap_torch.geometry.trajectory import station as along_track
 from crowdmap_torch.noise.stated_sigmas import stated_sigmas
+from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.tables import Journey, Signs, Tracklets
 
 _FASTEST_MPS = 70.0
@@ -201,7 +202,7 @@ def miss_sigma(
     if not len(miss):
         return miss.new_zeros(3)
     along = (crowd.viewing_axes[used].mT @ miss[..., None])[..., 0]
-    return 1.4826 * along.abs().median(0).values
+    return 1.4826 * median_along(along.abs(), 0)
 
 
 def enough_to_tell(

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_median
-from crowdmap_torch.optim.robust import median_scale
+from crowdmap_torch.optim.robust import median_along, median_scale
 from crowdmap_torch.ranges import Count, Degrees, Deviations, Length, Settings, Share
 from crowdmap_torch.tables import Signs
 
@@ -130,7 +130,7 @@ def journey_statistics(
     along = (axes.mT @ R[:, :, :1])[..., 0]
     roll = torch.atan2(along[:, 1], along[:, 0])
     stretch = (member.size.log() - head.size.log()).mean(1)
-    centre = translation.median(0).values if journeys else translation.sum(0)
+    centre = median_along(translation, 0) if journeys else translation.sum(0)
     return JourneyStatistics(
         signs=number,
         checked=checked,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.neighbours import cross_pairs
 from crowdmap_torch.geometry import camera, polygon, se3
+from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.tables import Association, Journey, Rows, SignDetections, Signs
 
 
@@ -93,7 +94,7 @@ def projection_errors(
     count = polygon.corner_count(signs.shape[sign])
     corners = polygon.roll(detections.corners_px[rows], association.sign_shift[rows], count)
     # Padded slots repeat the last corner, which hardly moves the median.
-    error = (corners - px).median(1).values
+    error = median_along(corners - px, 1)
 
     t = journey.t_ns - journey.t_ns[:1]
     window = round(1e9 * window_s)

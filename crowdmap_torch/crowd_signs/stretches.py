@@ -14,7 +14,7 @@ from crowdmap_torch.crowd_signs.gather import CrowdSigns
 from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
 from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
 from crowdmap_torch.noise.positioning import PositioningNoise
-from crowdmap_torch.optim.robust import median_scale
+from crowdmap_torch.optim.robust import median_along, median_scale
 
 _STRETCH = 1 / 10
 """Of the way on which a bias forgets where it was: the most that it is taken to stand still over."""
@@ -46,7 +46,7 @@ def first_biases(
     free = replace(crowd, bias_sigma=_FREE * crowd.bias_sigma)
     far = replace(config, radius_m=_FARTHER * config.radius_m, height_m=_FARTHER * config.height_m)
     found = vote_by_stretch(free, start, positioning, far, generator=same)
-    away = (found.translation - found.translation.median(0).values) / crowd.bias_sigma
+    away = (found.translation - median_along(found.translation, 0)) / crowd.bias_sigma
     least = _LARGER * (1 + _CHANCE / max(crowd.journeys, 1))
     if any(float(median_scale(axis)) > least for axis in away.unbind(1)):
         return found, free.bias_sigma

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.tables import Journey
 
 LEAST_SIGMA_M = 1e-3
@@ -22,7 +23,7 @@ def stated_sigmas(journey: Journey) -> tuple[Float[Tensor, " 3"] | None, Float[T
     """
     position, rotation = journey.sigma_position, journey.sigma_rotation
     if position is not None:
-        position = position.median(0).values
+        position = median_along(position, 0)
         position = position if bool((position >= LEAST_SIGMA_M).all()) else None
     if rotation is not None:
         rotation = rotation.median()

@@ -207,6 +207,14 @@ def _at_normal(c: float, dim: int) -> tuple[float, float]:
     return mean, slope**2 / square
 
 
+def median_along(value: Float[Tensor, ...], dim: int) -> Float[Tensor, ...]:
+    """As `Tensor.median(dim).values`, which torch has on a GPU only in no fixed order."""
+    ranked = value.sort(dim=dim).values
+    middle = ranked.select(dim, (value.shape[dim] - 1) // 2)
+    last = ranked.select(dim, -1)
+    return torch.where(last.isnan(), last, middle)
+
+
 def median_scale(residual: Float[Tensor, " n"], *, floor: float = 0.0) -> Float[Tensor, ""]:
     """Robust standard deviation: 1.4826 times the median absolute value, at least `floor`."""
     if not len(residual):

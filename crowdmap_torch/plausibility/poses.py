@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.plausibility.finding import Finding, Repair
 from crowdmap_torch.plausibility.units import UnitLimits, unit_findings, usual_speed
 from crowdmap_torch.tables import Journey, Origin
@@ -101,7 +102,7 @@ def in_kilometres(journey: Journey, limits: PoseLimits | None = None) -> Journey
 def _place(journey: Journey, origin: Origin, limits: PoseLimits) -> Finding | None:
     """Positions that are no metres from the origin."""
     across = _links(journey)[:, :2, 3]
-    x, y = across.median(0).values.tolist()
+    x, y = median_along(across, 0).tolist()
     is_still = float((across.amax(0) - across.amin(0)).norm()) < 1.0
     near = {(origin.lat_deg, origin.lon_deg), (origin.lon_deg, origin.lat_deg)}
     if is_still and any(abs(x - a) < 1 and abs(y - b) < 1 for a, b in near):

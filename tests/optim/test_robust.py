@@ -8,7 +8,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.linearize import chunks, term_costs
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
-from crowdmap_torch.optim.robust import JointTukey, Tukey, usual
+from crowdmap_torch.optim.robust import JointTukey, Tukey, median_along, usual
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 ROW_DIM = 2
@@ -138,3 +138,12 @@ def test_what_is_usual_is_what_half_of_the_weight_says_or_what_is_assumed():
     assert usual(value, weight, assumed=1.0, beside=20.0) == 4.0
     assert usual(value, weight, assumed=1.0, beside=60.0) == 1.0
     assert usual(value[:0], weight[:0], assumed=1.0, beside=20.0) == 1.0
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8])
+@pytest.mark.parametrize("dim", [0, 1, -1])
+def test_a_median_along_an_axis_is_torchs(count: int, dim: int):
+    value = normal(count, count, seed=count)
+    assert torch.equal(median_along(value, dim), value.median(dim).values)
+    value[0, 0] = torch.nan
+    assert torch.equal(median_along(value, dim).isnan(), value.median(dim).values.isnan())
