@@ -116,7 +116,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="LEVEL",
         help=f"write the map in tiles of HERE's and NDS's grid (level {DEFAULT_LEVEL} without LEVEL)",
     )
-    parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
+    parser.add_argument(
+        "--device",
+        default="cpu",
+        help="cpu (default), or cuda: from the clusters on, with --engine local from the first frame on",
+    )
     parser.add_argument(
         "--workers",
         type=argument(Workers),
@@ -181,7 +185,7 @@ def _map(
     options: argparse.Namespace, folder: RunFolder, config: MapperConfig, where: Whereabouts
 ) -> int:
     with input_read():
-        given = _read(options, config, device := where.device)
+        device, given = where.device, _read(options, config, where.of_journeys)
         dataset, survey, truth = given.dataset, given.survey, given.truth
         inputs = inputs_of(dataset, config, survey, truth, given.control, given.cars, device=device)
         kept = Checkpoint(folder.checkpoint, inputs)
@@ -199,11 +203,11 @@ def _map(
         log.log_config(dump(config))
 
         # ---- one journey at a time (section IV) ----
-        journeys = dataset.journeys
-        keep = keep_and_log(kept.keep_journey, log, journeys)
+        keep = keep_and_log(kept.keep_journey, log, dataset.journeys)
         how = {"known": found.journeys, "progress": progress, "keep": keep}
-        maps = mapper.map_journeys(journeys, config, **where.by_whom(look, config), **how)
-        where.close()
+        maps = mapper.map_journeys(dataset.journeys, config, **where.by_whom(look, config), **how)
+        dataset, maps = where.mapped(dataset, maps)
+        journeys = dataset.journeys
 
         # ---- landmarks of all journeys told apart, biases found (section V-A) ----
         progress("clusters and biases")

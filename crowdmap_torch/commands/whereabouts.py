@@ -21,7 +21,7 @@ from crowdmap_torch.io.stored_drives import StoredDrive, stored_drives
 from crowdmap_torch.plausibility.dataset import Look, look_over
 from crowdmap_torch.processes.threads import repeatable
 from crowdmap_torch.processes.workers import WorkerLost
-from crowdmap_torch.tables import Dataset, Tracklets
+from crowdmap_torch.tables import Dataset, Tracklets, to_device
 
 
 class ByWhom(TypedDict):
@@ -43,7 +43,10 @@ class Whereabouts(ExitStack):
         super().__init__()
         self._options = options
         self.device = _device(options.device)
-        self.engine = _engine(options, self.device)
+        """Where the map is made of the journeys."""
+        self.engine = _engine(options)
+        self.of_journeys = self.device if self.engine.name == "local" else torch.device("cpu")
+        """Where journeys are read and mapped: by other processes on CPUs, which are faster at it than a GPU."""
         self.at_work: Engine | None = None
         """The engine, where there is work for it."""
         self.stored: tuple[StoredDrive, ...] | None = None
@@ -100,14 +103,25 @@ class Whereabouts(ExitStack):
     def by_whom(self, look: Look, config: MapperConfig) -> ByWhom:
         """Who maps journeys, and the signs that were told apart for the look where mapping would do it alike."""
         is_alike = config.resolved().sign_association == config.sign_association
-        tracklets = look.tracklets if is_alike and self.device.type == "cpu" else {}
+        tracklets = look.tracklets if is_alike and self.of_journeys.type == "cpu" else {}
         return {"engine": self.at_work, "stored": self.stored, "tracklets": tracklets}
 
+    def mapped(
+        self, dataset: Dataset, maps: tuple[mapper.JourneyMap, ...]
+    ) -> tuple[Dataset, tuple[mapper.JourneyMap, ...]]:
+        """The journeys and their maps where the map is made; the workers are ended."""
+        self.close()
+        return to_device((dataset, maps), self.device)
+
     def of_convoys(self, bundle: Bundle) -> Engine | None:
-        """An engine for the convoys of an adjustment, begun; None: there is one convoy, for this process."""
+        """An engine for the convoys of an adjustment, begun; None: there is one convoy, for this process.
+
+        What is on a GPU stays in this process.
+        """
         if len(bundle.convoys) == 1:
             return None
-        engine = _engine(self._options, self.device)
+        on_gpu = self.device.type == "cuda"
+        engine = engine_of("local") if on_gpu else _engine(self._options)
         engine.spent = self.engine.spent
         with input_read():
             return self.enter_context(engine)
@@ -124,14 +138,8 @@ def _device(name: str) -> torch.device:
     return device
 
 
-def _engine(options: argparse.Namespace, device: torch.device) -> Engine:
+def _engine(options: argparse.Namespace) -> Engine:
     """Where journeys are mapped, not begun yet."""
     name = options.engine
-    if device.type == "cuda":
-        if name not in (None, "local"):
-            raise ValueError(
-                f"--engine {name}: what runs on a GPU stays in this process; leave it out"
-            )
-        name = "local"
     with needing(f"--engine {name}", "'crowdmap_torch[ray]'"):
         return engine_of(name, workers=options.workers, address=options.address)
