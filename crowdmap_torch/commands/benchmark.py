@@ -10,6 +10,7 @@ import argparse
 from crowdmap_torch.commands.subcommands import add_subcommands
 
 BENCHMARKS = {
+    "adjustment": "the mapper's own adjustment, on a CPU and on a GPU",
     "association": "landmarks told apart, ours against the paper's method",
     "bundle": "bundle adjustment, ours against Ceres and GTSAM",
     "cluster": "clustering at scale, ours against scikit-learn",
