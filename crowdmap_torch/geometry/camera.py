@@ -27,6 +27,8 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import debug_unwrap, vjp
 
+from crowdmap_torch.processes.amounts import at_once
+
 MODELS = ("brown_conrady", "kannala_brandt")
 COEFFICIENT_COUNTS = {"brown_conrady": (0, 4, 5, 8, 12, 14), "kannala_brandt": (4,)}
 """How many distortion coefficients each model can have."""
@@ -36,6 +38,8 @@ CLOSING_TOLERANCE_PX = 0.01
 """A pixel closes if it is undistorted and distorted again with a smaller error."""
 
 _MIN_POLE_ANGLE = math.radians(10.0)
+_LOT = 1 << 14
+"""Pixels whose projective maps are found at once on a CPU: what each step makes is as large as all that is kept."""
 _CHUNK = 1 << 18
 _NEWTON_STEPS = 30
 _CONVERGED_PX = 1e-9
@@ -152,6 +156,18 @@ def observation_matrix(
     ideal` the error is `distort(ideal) - px + W d / (1 + g . d)`, W being the lens' derivative and g its `bend`, found
     here unless it is given.
     """
+    parts = (px, ideal) if bend is None else (px, ideal, bend)
+    lots = (part.reshape(-1, 2).split(at_once(_LOT, px.device)) for part in parts)
+    found = [_observation_chunk(camera, *lot) for lot in zip(*lots, strict=True)]
+    return torch.cat(found).view(*px.shape[:-1], 3, 3)
+
+
+def _observation_chunk(
+    camera: Camera,
+    px: Float[Tensor, "n 2"],
+    ideal: Float[Tensor, "n 2"],
+    bend: Float[Tensor, "n 2"] | None = None,
+) -> Float[Tensor, "n 3 3"]:
     observed, W = _distort_with_jacobian(camera, ideal)
     g = projective_bend(camera, ideal) if bend is None else bend
     # At the undistorted pixel nothing but rounding where that closes.

@@ -14,11 +14,14 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.optim.robust import median_scale
+from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.ranges import Pixels, Settings, Sigma
 
 _CLASSES = 8
 """Classes of boxes of about equal numbers, by size."""
+_LOT = 1 << 10
+"""Detections of which whitening is found at once on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +67,20 @@ def detection_noise(
 ) -> DetectionNoise:
     """The noise of detections whose pixels are noisier by `factor` than usual, and whose poses have such a variance."""
     box = (corners_px.amax(1) - corners_px.amin(1)).amax(-1)
-    pixel = config.sigma_px**2 * (1 + (config.small_box_px / box).square())
-    covariance = (by_pose * pose_variance[:, None]) @ by_pose.mT
-    covariance.diagonal(dim1=-2, dim2=-1).add_((pixel * factor.square())[:, None])
-    by_scale = box_scales(corners_px) * config.box_sigma
-    covariance = covariance + by_scale @ by_scale.mT
-    lower = torch.linalg.cholesky(covariance)
-    eye = torch.eye(lower.shape[-1], dtype=lower.dtype, device=lower.device)
-    whitening = torch.linalg.solve_triangular(lower, eye.expand_as(lower), upper=False)
+    pixel = config.sigma_px**2 * (1 + (config.small_box_px / box).square()) * factor.square()
+    dim = by_pose.shape[1]
+    whitening = by_pose.new_empty(len(by_pose), dim, dim)
+    eye = torch.eye(dim, dtype=by_pose.dtype, device=by_pose.device)
+    # In lots: each of these steps makes matrices as large as all that is kept.
+    lot = at_once(_LOT, by_pose.device)
+    for first in range(0, len(by_pose), lot):
+        here = slice(first, first + lot)
+        covariance = (by_pose[here] * pose_variance[here, None]) @ by_pose[here].mT
+        covariance.diagonal(dim1=-2, dim2=-1).add_(pixel[here, None])
+        by_scale = box_scales(corners_px[here]) * config.box_sigma
+        covariance += by_scale @ by_scale.mT
+        lower = torch.linalg.cholesky(covariance)
+        whitening[here] = torch.linalg.solve_triangular(lower, eye.expand_as(lower), upper=False)
     return DetectionNoise(whitening, by_pose, pose_variance, pose_error)
 
 

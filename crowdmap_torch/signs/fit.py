@@ -30,6 +30,7 @@ from crowdmap_torch.noise.positioning import (
     places_on_path,
 )
 from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.linearize import CHUNK_ROWS
 from crowdmap_torch.optim.linearize import residuals as rows_of_term
 from crowdmap_torch.optim.problem import (
     CostTerm,
@@ -43,6 +44,7 @@ from crowdmap_torch.optim.problem import (
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.optim.solvers.banded_schur import BandBackend, BandNormalEquations
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, NormalEquations
+from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.ranges import Deviations, RoundsOrNone, Settings, Share
 from crowdmap_torch.residuals.reprojection import (
     corner_errors_jacobian,
@@ -154,6 +156,8 @@ def fit_signs(
         normal = backend.assemble(problem, state.values)
         if number == 0:
             scale = _likely_scale(problem, state.values, normal, positioning, config.drift)
+        # Large beside what the next round makes of it.
+        del noise, still, values, problem, state
     assert normal is not None and whitened is not None
     return _read(
         normal,
@@ -338,19 +342,23 @@ def _noise(
 
     `extra_variance` is that of positions and of rotations beyond their white noise.
     """
-    at = views.sign
-    template = polygon.template(shape).to(start.size)[at]
-    moved, placed = se3.retract(T_world_camera, pose_error), start.T_world_sign[at]
-    rows_last = (
-        x.movedim(0, -1) for x in (moved, placed, start.size[at], template, views.observation)
-    )
-    _, (by_pose, _, _) = corner_errors_jacobian(*rows_last)
-    by_pose = by_pose.permute(2, 0, 1).contiguous()
+    template = polygon.template(shape).to(start.size)
+    moved = se3.retract(T_world_camera, pose_error)
+    by_pose = moved.new_empty(len(views), 2 * polygon.MAX_CORNERS, 6)
+    # In lots: beside these there are the derivatives by all else.
+    lot = at_once(CHUNK_ROWS, moved.device)
+    for first in range(0, len(views), lot):
+        here = slice(first, first + lot)
+        at = views.sign[here]
+        placed = moved[here], start.T_world_sign[at], start.size[at], template[at]
+        rows_last = (x.movedim(0, -1) for x in (*placed, views.observation[here]))
+        _, (by_pose_here, _, _) = corner_errors_jacobian(*rows_last)
+        by_pose[here] = by_pose_here.permute(2, 0, 1)
     sigma_m = config.white_share * positioning.white_sigma_m
     white = extra_variance.new_tensor((sigma_m, positioning.white_sigma_rad))
     variance = (white.square() + extra_variance).repeat_interleave(3, dim=-1)
     return detection_noise(
-        views.corners_px, noise_scale[at], by_pose, variance, pose_error, config.pixels
+        views.corners_px, noise_scale[views.sign], by_pose, variance, pose_error, config.pixels
     )
 
 

@@ -280,6 +280,19 @@ def test_observation_matrix_gives_the_raw_pixel_error_near_the_detection(lens, g
     assert miss.max() < 0.05
 
 
+def test_observation_matrices_of_many_pixels_are_those_of_each(monkeypatch, generator):
+    lens = make_camera(next(iter(BROWN_CONRADY)))
+    px = 100 + 200 * torch.rand(5, 3, 2, generator=generator, dtype=torch.float64)
+    ideal, _ = camera.unproject(lens, px)
+    bend = camera.projective_bend(lens, ideal)
+    expected = camera.observation_matrix(lens, px, ideal)
+    monkeypatch.setattr(camera, "_LOT", 4)
+    close = torch.testing.assert_close
+    close(camera.observation_matrix(lens, px, ideal), expected, rtol=1e-12, atol=1e-12)
+    close(camera.observation_matrix(lens, px, ideal, bend=bend), expected, rtol=1e-12, atol=1e-12)
+    assert camera.observation_matrix(lens, px[:0], ideal[:0]).shape == (0, 3, 3, 3)
+
+
 def test_observation_matrix_is_right_to_first_order_at_the_detection(lens, generator):
     ideal = ideal_points(lens, 100, generator)
     px = camera.distort(lens, ideal)

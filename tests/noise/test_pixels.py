@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from crowdmap_torch.noise import pixels
 from crowdmap_torch.noise.pixels import (
     _CLASSES,
     DetectionNoise,
@@ -99,6 +100,25 @@ def test_covariances_are_those_of_pixels_boxes_and_poses():
     assert float(covariance[1, 1]) == pytest.approx(pixel + side**2)
     # Left and right sides of a box part, the pose moves them alike.
     assert float(covariance[0, 2]) == pytest.approx(-(side**2) + (10 * 0.3) ** 2)
+
+
+def test_many_detections_have_the_noise_of_each(monkeypatch, generator):
+    by_pose = torch.randn(10, 16, 6, dtype=F64, generator=generator)
+    corners = torch.cat([box_of(side) for side in range(5, 55, 5)])
+    factor = torch.linspace(1, 3, 10, dtype=F64)
+    variance = torch.rand(10, 6, dtype=F64, generator=generator)
+
+    def found(some: slice) -> torch.Tensor:
+        known = corners[some], factor[some], by_pose[some]
+        return detection_noise(*known, variance[some], variance[some], CONFIG).whitening
+
+    monkeypatch.setattr(pixels, "_LOT", 4)
+    of_all = found(slice(None))
+    for i in range(10):
+        torch.testing.assert_close(
+            of_all[i : i + 1], found(slice(i, i + 1)), rtol=1e-12, atol=1e-12
+        )
+    assert found(slice(0)).shape == (0, 16, 16)
 
 
 def test_outlines_that_are_no_boxes_have_no_error_of_their_sides():
