@@ -189,7 +189,7 @@ class Products:
         self._waiting, self._held = {}, 0
 
 
-_HELD = 1 << 24
+_HELD = 1 << 22
 """Numbers of windows that may wait."""
 _LOT = 1 << 19
 """Numbers of right-hand sides that are solved for at once."""

@@ -27,6 +27,9 @@ from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
+_NUMBERS = 1 << 20
+"""Numbers of right-hand sides that are solved for at once on a CPU."""
+
 
 @dataclass(frozen=True)
 class Through:
@@ -94,20 +97,39 @@ class ChainBorder:
     ) -> Through:
         """What A^-1 of right-hand sides of a part's blocks is to what stays.
 
-        `column` is that of each block in the landmarks' sums; the products with what stands `beside` are summed up as well.
+        A few right-hand sides at a time: solved they are larger than all that is told of them. `column` is that of each
+        block in the landmarks' sums; the products with what stands `beside` are summed up as well.
         """
-        structure, c = self.structure, right_side.shape[-1]
-        x = part.solved(leads, right_side)
-        chain, of = torch.unique(structure.owner[part.block], return_inverse=True)
-        row, by_landmark = self._couple(part, x, column, columns)
-        by_chain = x.new_zeros(len(chain), self.link.shape[-1], c)
-        own = x.new_zeros(len(chain), c, beside.shape[-1])
+        chain, of = torch.unique(self.structure.owner[part.block], return_inverse=True)
+        most = at_once(_NUMBERS, of.device) // max(right_side[..., :1].numel(), 1)
+        found = []
+        for some in right_side.split(max(most, 1), dim=-1):
+            x = part.solved(leads, some)
+            row, by_landmark = self._couple(part, x, column, columns)
+            found.append((row, by_landmark, *self._by_chain(part, x, of, len(chain), beside)))
+        row = found[0][0]
+        by_landmark, by_chain = (torch.cat([one[i] for one in found], dim=-1) for i in (1, 2))
+        own = torch.cat([one[3] for one in found], dim=1)
+        return Through(row, by_landmark, chain, by_chain, own)
+
+    def _by_chain(
+        self,
+        part: Part,
+        x: Float[Tensor, "places k c"],
+        of: Int[Tensor, " n"],
+        chains: int,
+        beside: Float[Tensor, "n k d"],
+    ) -> tuple[Float[Tensor, "h b c"], Float[Tensor, "h c d"]]:
+        """F^T x of a part, and x^T times what stands `beside`, chain by chain."""
+        c = x.shape[-1]
+        by_chain = x.new_zeros(chains, self.link.shape[-1], c)
+        own = x.new_zeros(chains, c, beside.shape[-1])
         lot = at_once(CHUNK_ROWS, of.device)
         for some in torch.arange(len(of), device=of.device).split(lot):
             of_some = x[part.place[some]]
             add_at(by_chain, 0, of[some], self.link[part.block[some]].mT @ of_some)
             add_at(own, 0, of[some], of_some.mT @ beside[some])
-        return Through(row, by_landmark, chain, by_chain, own)
+        return by_chain, own
 
     def _couple(
         self, part: Part, x: Float[Tensor, "places k c"], column: Int[Tensor, " n"], columns: int

@@ -15,8 +15,15 @@ from worlds.bordered_chains import (
 )
 
 from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.solvers import border
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
+
+
+@pytest.fixture(params=["all", "one by one"], autouse=True)
+def right_sides_at_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.param != "all":
+        monkeypatch.setattr(border, "_NUMBERS", 1)
 
 
 @pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
