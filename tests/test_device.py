@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import fields, is_dataclass
@@ -10,12 +11,13 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
-from worlds.devices import FRAMES, assert_near, differences, first_frames, optimized, short
+from worlds.devices import FRAMES, differences, first_frames, optimized, short
 from worlds.drives import write_tiny
 from worlds.pretend_device import DEVICE, PretendTensor, Transfers, pretend_device
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.commands.whereabouts import Whereabouts
 from crowdmap_torch.evaluation.evaluate import against, evaluate_map, progress_scalars
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import read_map
@@ -213,10 +215,16 @@ def test_optimize_makes_the_cpus_map_to_the_last_bit(
 
 
 def test_journeys_are_mapped_by_processes_on_the_cpu_where_there_are_several(
-    folder: Path, tmp_path: Path, run_here: tuple[Path, str], transfers
+    here: Dataset, first_here: Stages, transfers
 ):
-    run, _ = optimized(folder, tmp_path / "run", "cuda:0", workers=2)
-    one, other = read_map(run_here[0] / "map"), read_map(run / "map")
-    # Those know nothing of the one way to compute: to rounding.
-    assert_near(one.signs, other.signs, within=1e-8)
-    assert_near(one.lanes, other.lanes, within=1e-8)
+    asked = {"device": "cuda:0", "address": None}
+    alone = Whereabouts(Namespace(engine=None, workers=1, **asked))
+    assert (alone.engine.name, alone.of_journeys) == ("local", DEVICE)
+    beside = Whereabouts(Namespace(engine=None, workers=2, **asked))
+    assert (beside.engine.name, beside.of_journeys.type) == ("processes", "cpu")
+    # What they made is moved once.
+    transfers.clear()
+    dataset, maps = beside.mapped(here, first_here[0])
+    assert isinstance(dataset.journeys[0].t_ns, PretendTensor)
+    assert isinstance(maps[0].signs.size, PretendTensor)
+    assert not transfers.back and not transfers.scalars

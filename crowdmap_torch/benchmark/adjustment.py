@@ -22,6 +22,7 @@ from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.io.datasets import load_dataset
+from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.processes.threads import one_core_each, repeatable
 from crowdmap_torch.ranges import Workers, argument
 
@@ -38,9 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Prints a line for each device, and how far apart they end."""
-    devices = [torch.device("cpu"), torch.device(options.device)]
-    if devices[1].type == "cuda" and not torch.cuda.is_available():
-        devices = devices[:1]
+    # What is asked for wrongly is said before anything is mapped.
+    devices = [torch.device("cpu"), there(options.device)]
     config, dataset = MapperConfig(), load_dataset(options.dataset)
     with engine_of(None, workers=options.workers) as engine:
         maps = mapper.map_journeys(dataset.journeys, config, engine=engine)
@@ -50,17 +50,27 @@ def run(options: argparse.Namespace) -> None:
     frames = sum(journey.frame_count for journey in dataset.journeys)
     print(f"{len(dataset.journeys)} journeys, {frames} frames, {len(first.signs)} signs")
     print(f"{'device':<8}{'start':>10}{'steps':>8}{'median':>10}{'in all':>10}{'cost':>18}")
-    runs = [_adjusted(copy.deepcopy(bundle), device) for device in devices]
-    for device, one in zip(devices, runs, strict=True):
-        print(f"{device!s:<8}{one.line()}", flush=True)
-    if len(runs) == 1:
-        print(f"{options.device:<8}{'not there':>10}")
-        return
+    runs = []
+    for device in devices:
+        if device is None:
+            print(f"{options.device:<8}{'not there':>10}")
+            return
+        runs.append(_adjusted(copy.deepcopy(bundle), device))
+        print(f"{device!s:<8}{runs[-1].line()}", flush=True)
     cpu, other = runs
     print(f"{cpu.total_s / other.total_s:.1f} times faster; largest differences:")
     for name, value in cpu.values.items():
         if value.numel():
             print(f"  {name:<10}{float((value - other.values[name]).abs().max()):>10.1e}")
+
+
+def there(name: str) -> torch.device | None:
+    """The device of a name; None: it is not there."""
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"--device {name}: expected cpu or cuda") from None
+    return None if device.type == "cuda" and not torch.cuda.is_available() else device
 
 
 @dataclass(frozen=True)

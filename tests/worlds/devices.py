@@ -52,12 +52,11 @@ def first_frames(dataset: Dataset) -> Journey:
     return with_frames(dataset.journeys[0], torch.arange(FRAMES))
 
 
-def optimized(folder: Path, out: Path, device: str, *, workers: int = 1) -> tuple[Path, str]:
-    """A run of the main job on this device, and what it said; journeys are mapped elsewhere by more than one worker."""
+def optimized(folder: Path, out: Path, device: str) -> tuple[Path, str]:
+    """A run of the main job on this device, in one process, and what it said."""
     config, said = folder.parent / "short.yaml", io.StringIO()
     config.write_text(CONFIG)
-    options = ["--config", str(config), "--device", device, "--log-every", "2"]
-    options += ["--workers", str(workers)]
+    options = ["--config", str(config), "--device", device, "--workers", "1", "--log-every", "2"]
     with contextlib.redirect_stdout(said):
         assert cli.main(["optimize", str(folder), "--out", str(out), *options]) == 0
     return out, said.getvalue()
