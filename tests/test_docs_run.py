@@ -43,6 +43,8 @@ NOT_RUN: Mapping[str, str] = {
     "python scripts/soak.py signals": "maps for a minute; test_interrupted.py does the same by SIGKILL",
     "crowdmap optimize /data/city --out /data/run --engine ray --address FIRST:6379": "needs a cluster",
     "crowdmap optimize --engine ray --address HOST:PORT": "needs a cluster",
+    "crowdmap benchmark bundle --device cuda --solvers ours --repeats 1": "needs a GPU",
+    "crowdmap optimize DATA --device cuda --engine local": "needs a GPU; tests/test_cuda.py does it",
     "ray start --head --port 6379 --num-cpus 16": "begins a cluster that outlives it",
     "ray start --address FIRST:6379 --num-cpus 16": "needs a cluster",
     "ray stop": "ends every cluster of the machine, ours or not",
@@ -116,6 +118,7 @@ SMALLER: Mapping[str, str] = {
     "crowdmap simulate": SMALL,
     # One process: others would import everything once more.
     "crowdmap optimize": "--workers 1",
+    "crowdmap benchmark adjustment": "--workers 1",
     "crowdmap benchmark association": "--workers 1 --methods joint",
     "crowdmap benchmark stages": "--workers 1",
     "crowdmap benchmark bundle": "--sizes 2x6x4 --repeats 1 --solvers ours",
