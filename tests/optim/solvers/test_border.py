@@ -20,7 +20,7 @@ from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
 
-@pytest.fixture(params=["all", "one by one"], autouse=True)
+@pytest.fixture(params=["all", "one by one"])
 def right_sides_at_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if request.param != "all":
         monkeypatch.setattr(border, "_NUMBERS", 1)
@@ -28,7 +28,7 @@ def right_sides_at_once(request: pytest.FixtureRequest, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
 @pytest.mark.parametrize("lengths", [(30, 1, 17), (1,), (64, 63)])
-def test_a_border_gives_the_dense_step(lengths, world):
+def test_a_border_gives_the_dense_step(lengths, world, right_sides_at_once):
     problem, values, plan = world(lengths)
     ours, dense = (b.assemble(problem, values) for b in (ChainBackend(plan), DenseBackend()))
     torch.testing.assert_close(ours.cost, dense.cost)
@@ -83,7 +83,7 @@ def test_a_step_tells_by_how_many_sigmas_landmarks_and_border_move(world):
 
 
 @pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
-def test_covariances_are_blocks_of_the_dense_inverse(world):
+def test_covariances_are_blocks_of_the_dense_inverse(world, right_sides_at_once):
     problem, values, plan = world()
     dense = DenseBackend().assemble(problem, values)
     inverse, chain = torch.linalg.inv(dense.hessian[0]), plan.chain
