@@ -19,10 +19,10 @@ from torch import Tensor
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.benchmark.devices import finish, there
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.io.datasets import load_dataset
-from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.processes.threads import one_core_each, repeatable
 from crowdmap_torch.ranges import Workers, argument
 
@@ -64,15 +64,6 @@ def run(options: argparse.Namespace) -> None:
             print(f"  {name:<10}{float((value - other.values[name]).abs().max()):>10.1e}")
 
 
-def there(name: str) -> torch.device | None:
-    """The device of a name; None: it is not there."""
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise InputError(f"--device {name}: expected cpu or cuda") from None
-    return None if device.type == "cuda" and not torch.cuda.is_available() else device
-
-
 @dataclass(frozen=True)
 class Adjusted:
     """An adjustment on one device."""
@@ -102,21 +93,15 @@ def _adjusted(bundle: Bundle, device: torch.device) -> Adjusted:
     """The adjustment of a bundle, moved there before the clock starts."""
     repeatable(device)
     bundle = bundle.to(device)
-    _finish(device)
+    finish(device)
     times = [time.perf_counter()]
     last = begun = adjust.start(bundle)
-    _finish(device)
+    finish(device)
     times.append(time.perf_counter())
     for _, after, _ in adjust.steps(bundle, begun):
         last = after
-        _finish(device)
+        finish(device)
         times.append(time.perf_counter())
     start_s, *steps_s = (b - a for a, b in pairwise(times))
     values = {name: value.detach().cpu() for name, value in last.values.items()}
     return Adjusted(start_s, steps_s, float(last.cost), values)
-
-
-def _finish(device: torch.device) -> None:
-    """Waits for what was begun there."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

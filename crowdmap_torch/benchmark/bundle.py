@@ -25,6 +25,7 @@ import torch
 
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.benchmark import free_corners
+from crowdmap_torch.benchmark.devices import finish
 from crowdmap_torch.benchmark.free_corners import FreeCorners
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.errors import InputError
@@ -103,10 +104,10 @@ def solve(
     tiny = free_corners.simulate(3, 12, 2)
     _minimise(tiny, *_prepared(tiny, device))
     prepared = _prepared(problem, device)
-    _synchronise(device)
+    finish(device)
     ready = time.perf_counter()
     first, last = _minimise(problem, *prepared)
-    _synchronise(device)
+    finish(device)
     done = time.perf_counter()
     q = se3.to_quaternion(last.values["pose"][:, :3, :3]).cpu().numpy()
     p, X = last.values["pose"][:, :3, 3].cpu().numpy(), last.values["point"].cpu().numpy()
@@ -141,11 +142,6 @@ def _minimise(
     corner = replace(built.terms["corner"], loss=Tukey(problem.tukey_c))
     built = replace(built, terms={**built.terms, "corner": corner})
     return first, lm.solve(built, first.values, MINIMISATION, backend=backend)
-
-
-def _synchronise(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def growth(medians: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Iterator[str]:

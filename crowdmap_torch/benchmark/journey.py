@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from crowdmap_torch.benchmark.devices import finish
 from crowdmap_torch.config import METHODS, MapperConfig
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.datasets import load_dataset
@@ -120,8 +121,7 @@ def batch_speed(journeys: tuple[Journey, ...], rate_hz: float, device: str) -> t
     map_journey(moved[0], 0, MapperConfig())
     start = time.perf_counter()
     map_journeys(moved, MapperConfig())
-    if device != "cpu":
-        torch.cuda.synchronize()
+    finish(torch.device(device))
     spent = time.perf_counter() - start
     driven = sum(journey.frame_count for journey in journeys) / rate_hz
     return spent / len(journeys), driven / spent

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from worlds.drives import write_tiny
 
-from crowdmap_torch.benchmark import adjustment
+from crowdmap_torch.benchmark import adjustment, devices
 from crowdmap_torch.io.errors import InputError
 
 
@@ -27,6 +27,6 @@ def test_two_devices_are_compared_and_one_that_is_not_there_is_said_not_to_be(
     assert all(float(most) == 0 for _, most in differences)
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    assert adjustment.there("cuda") is None
+    assert devices.there("cuda") is None
     with pytest.raises(InputError, match="--device abacus: expected cpu or cuda"):
-        adjustment.there("abacus")
+        devices.there("abacus")

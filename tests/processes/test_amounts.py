@@ -1,4 +1,4 @@
-"""How much is computed at once on each device, and that the result does not depend on it."""
+"""How much is computed at once on each device."""
 
 import torch
 

@@ -102,15 +102,14 @@ class ChainBorder:
         """
         chain, of = torch.unique(self.structure.owner[part.block], return_inverse=True)
         most = at_once(_NUMBERS, of.device) // max(right_side[..., :1].numel(), 1)
-        found = []
+        row, found = self._coupled(part), []
         for some in right_side.split(max(most, 1), dim=-1):
             x = part.solved(leads, some)
-            row, by_landmark = self._couple(part, x, column, columns)
-            found.append((row, by_landmark, *self._by_chain(part, x, of, len(chain), beside)))
-        row = found[0][0]
-        by_landmark, by_chain = (torch.cat([one[i] for one in found], dim=-1) for i in (1, 2))
-        own = torch.cat([one[3] for one in found], dim=1)
-        return Through(row, by_landmark, chain, by_chain, own)
+            by_landmark = self._couple(part, x, row, column, columns)
+            found.append((by_landmark, *self._by_chain(part, x, of, len(chain), beside)))
+        of_landmarks, of_chains, own = zip(*found, strict=True)
+        by_landmark, by_chain = (torch.cat(parts, dim=-1) for parts in (of_landmarks, of_chains))
+        return Through(row, by_landmark, chain, by_chain, torch.cat(own, dim=1))
 
     def _by_chain(
         self,
@@ -131,24 +130,34 @@ class ChainBorder:
             add_at(own, 0, of[some], of_some.mT @ beside[some])
         return by_chain, own
 
+    def _coupled(self, part: Part) -> Int[Tensor, " r"]:
+        """The columns of the reduced system that a part is coupled to."""
+        factors = self.structure.couplings.factors
+        each = [factors[name].column[own].flatten() for name, own in part.factors.items()]
+        return torch.unique(torch.cat([self.structure.owner.new_zeros(0), *each]))
+
     def _couple(
-        self, part: Part, x: Float[Tensor, "places k c"], column: Int[Tensor, " n"], columns: int
-    ) -> tuple[Int[Tensor, " r"], Float[Tensor, "r columns c"]]:
-        """The columns of the reduced system that a part is coupled to, and B x there."""
+        self,
+        part: Part,
+        x: Float[Tensor, "places k c"],
+        row: Int[Tensor, " r"],
+        column: Int[Tensor, " n"],
+        columns: int,
+    ) -> Float[Tensor, "r columns c"]:
+        """B x of a part, in the columns `row` of the reduced system."""
         structure = self.structure
-        each = [structure.couplings.factors[name].column[own] for name, own in part.factors.items()]
-        row = torch.unique(torch.cat([column.new_zeros(0), *(at.flatten() for at in each)]))
         total = x.new_zeros(len(row) * columns, x.shape[-1])
         lot = at_once(CHUNK_ROWS, x.device)
-        for (name, own), at in zip(part.factors.items(), each, strict=True):
-            block, factors = self.coupling[name][own], structure.couplings.factors[name].block[own]
+        for name, own in part.factors.items():
+            of_term = structure.couplings.factors[name]
+            block, factors, at = self.coupling[name][own], of_term.block[own], of_term.column[own]
             for begin in range(0, len(at), lot):
                 some = slice(begin, begin + lot)
                 of = structure.number[factors[some]]
                 entry = torch.searchsorted(row, at[some]) * columns + column[of][:, None]
                 product = block[some] @ x[part.place[of], : block.shape[2]]
                 add_at(total, 0, entry.flatten(), product.flatten(0, 1))
-        return row, total.view(-1, columns, x.shape[-1])
+        return total.view(-1, columns, x.shape[-1])
 
 
 @dataclass(frozen=True)
