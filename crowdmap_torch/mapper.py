@@ -23,7 +23,6 @@ from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
 from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_lanes
 from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
-from crowdmap_torch.crowd_signs.align import unbiased_poses
 from crowdmap_torch.crowd_signs.complete_tracks import (
     AssociatedSigns,
     CompletedTracks,
@@ -34,6 +33,7 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
 )
 from crowdmap_torch.crowd_signs.duplicates import may_be_one
 from crowdmap_torch.crowd_signs.gather import gather_signs
+from crowdmap_torch.crowd_signs.journey_bias import unbiased_poses
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.engine import Engine
@@ -274,7 +274,7 @@ def first_map(
             unbiased_lanes(pieces.select(torch.nonzero(is_good[pieces.frame])[:, 0]), drift)
             for pieces, drift, is_good in zip(made, drifts, trusted, strict=True)
         ]
-        joined = join_lanes(concatenate_lanes(moved), config.positioning, config.lane_join)
+        joined = join_lanes(concatenate_lanes(moved), crowd.positioning, config.lane_join)
         lanes, support, rounds = joined.lanes, joined.support, ()
     return FirstMap(
         signs=found.heads,
@@ -311,7 +311,7 @@ def build_bundle(
         first.lanes,
         first.associations,
         first.drifts,
-        config.positioning,
+        first.crowd.positioning,
         config.adjust,
         lane_tracklets=[m.lane_tracklets for m in maps],
         lane_support=first.lane_support,

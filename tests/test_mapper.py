@@ -222,6 +222,18 @@ def test_a_bad_drive_leaves_nothing_behind(tiny: Dataset, tiny_result: MapResult
     assert int(bundle.frame.max()) < int(frames[-2])
 
 
+def test_what_the_crowd_tells_of_positioning_is_what_the_adjustment_begins_with(
+    tiny: Dataset, tiny_result: MapResult
+):
+    maps, first = tiny_result.journey_maps, tiny_result.first
+    assert first.crowd.positioning.wander_length_m == CONFIG.positioning.wander_length_m
+    assert build_bundle(tiny.journeys, maps, first, CONFIG).prior.wander is None
+    told = replace(CONFIG.positioning, wander_length_m=40.0)
+    first = replace(first, crowd=replace(first.crowd, positioning=told))
+    wander = build_bundle(tiny.journeys, maps, first, CONFIG).prior.wander
+    assert wander is not None and wander.length_m == 40.0 and bool(wander.wanders.all())
+
+
 def test_inputs_are_left_as_they_were(tiny: Dataset):
     journey = with_frames(tiny.journeys[1], torch.arange(0, 60, 3))
     kept = [

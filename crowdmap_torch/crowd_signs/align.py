@@ -13,10 +13,8 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_median, group_sum
 from crowdmap_torch.crowd_signs.distance import mahalanobis
-from crowdmap_torch.geometry import se3
-from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
+from crowdmap_torch.crowd_signs.journey_bias import JourneyBias, bias_at, bias_given_places
 from crowdmap_torch.noise.positioning import PositioningNoise
-from crowdmap_torch.optim.band_cholesky import cholesky_banded
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.ranges import Rounds, Settings, Share, Sigma, Spacing
 from crowdmap_torch.tables import Signs
@@ -25,8 +23,6 @@ METHODS = ("robust", "paper2017")
 
 _CHI_SQUARE_MEDIAN = 2.366
 """Median squared length of a three-dimensional standard normal vector."""
-_AT_REST_M = 1e-4
-"""How far the bias of a drive wanders that is too short for it [m]."""
 _STANDS_STILL_M = 1e-3
 """Alternation ends when no bias moves by more [m]."""
 
@@ -51,60 +47,6 @@ class AlignConfig(Settings):
         super().__post_init__()
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
-
-
-@dataclass(frozen=True)
-class JourneyBias:
-    """What each journey's poses have wrong, measured place minus true place, up to what all journeys share.
-
-    At a place of a journey it is `translation + heading x (place - centroid) + drift(station)`. The station is the
-    distance driven; the drift is linear between nodes, which are equally spaced, and constant outside them. On long drives
-    part of it is how the bias wanders.
-    """
-
-    translation: Float[Tensor, "j 3"]
-    """[m]"""
-    heading: Float[Tensor, " j"]
-    """About the up axis through the journey's centroid [rad]."""
-    centroid: Float[Tensor, "j 3"]
-    """Mean place of the journey's landmarks, as measured [m]."""
-    covariance: Float[Tensor, "j 3 3"]
-    """Of the translation, given the places of the clusters [m^2]."""
-    shared_covariance: Float[Tensor, "3 3"]
-    """Of what all journeys share and nobody can tell from them: that of the prior's mean [m^2]."""
-    node_start: Int[Tensor, " j"]
-    """First row of `node_drift` of each journey."""
-    node_count: Int[Tensor, " j"]
-    """Nodes of each journey, at least two."""
-    node_origin: Float[Tensor, " j"]
-    """Station of the first node [m]."""
-    node_spacing: Float[Tensor, " j"]
-    """Distance between nodes [m]."""
-    node_drift: Float[Tensor, "k 3"]
-    """Drift at the nodes [m]."""
-    node_wander: Float[Tensor, "k 3"]
-    """What of it is the bias's that wanders [m]; zero on drives that are too short for it."""
-
-    def __len__(self) -> int:
-        return len(self.heading)
-
-    @property
-    def journey_of_node(self) -> Int[Tensor, " k"]:
-        """The journey that each node is on."""
-        journey = torch.arange(len(self), device=self.node_count.device)
-        return torch.repeat_interleave(journey, self.node_count)
-
-    @property
-    def node_station(self) -> Float[Tensor, " k"]:
-        """Distance driven at each node [m]."""
-        owner = self.journey_of_node
-        rank = torch.arange(len(owner), device=owner.device) - self.node_start[owner]
-        return self.node_origin[owner] + rank * self.node_spacing[owner]
-
-    @property
-    def length(self) -> Float[Tensor, " j"]:
-        """Way from the first to the last node of each journey [m]."""
-        return self.node_spacing * (self.node_count - 1)
 
 
 def no_bias(
@@ -139,41 +81,6 @@ def no_bias(
     )
 
 
-def bias_at(
-    bias: JourneyBias,
-    journey: Int[Tensor, " n"],
-    station: Float[Tensor, " n"],
-    place: Float[Tensor, "n 3"],
-) -> Float[Tensor, "n 3"]:
-    """What is wrong with measured places [m]: subtract it from them."""
-    node, along = _node_at(bias, journey, station)
-    drift = torch.lerp(bias.node_drift[node], bias.node_drift[node + 1], along[:, None])
-    lever = _lever(place - bias.centroid[journey])
-    return bias.translation[journey] + bias.heading[journey, None] * lever + drift
-
-
-def largest_drift(bias: JourneyBias) -> Float[Tensor, " j"]:
-    """Length of the largest drift along each journey, about its bias wherever that wanders [m]."""
-    length = (bias.node_drift - bias.node_wander).norm(dim=1)
-    return length.new_zeros(len(bias)).scatter_reduce(0, bias.journey_of_node, length, "amax")
-
-
-def unbiased_poses(
-    T_world_camera: Float[Tensor, "f 4 4"],
-    bias: JourneyBias,
-    journey: int,
-    station: Float[Tensor, " f"],
-) -> Float[Tensor, "f 4 4"]:
-    """The poses of one journey with its bias taken off: where bundle adjustment starts."""
-    rows = torch.full_like(station, journey, dtype=torch.int64)
-    position = T_world_camera[:, :3, 3]
-    heading = bias.heading[journey]
-    turn = se3.so3_exp(torch.stack((0 * heading, 0 * heading, -heading)))
-    return se3.make(
-        turn @ T_world_camera[:, :3, :3], position - bias_at(bias, rows, station, position)
-    )
-
-
 def align_journeys(
     signs: Signs,
     label: Int[Tensor, " n"],
@@ -202,7 +109,7 @@ def align_journeys(
     if config.method == "paper2017":
         bias = mean_differences(signs, label, station, start)
         return replace(bias, shared_covariance=shared)
-    used = _in_shared_clusters(signs.journey, label)
+    used = in_shared_clusters(signs.journey, label)
     members, label, station = signs[used], label[used], station[used]
     covariance = members.covariance + config.noise_sigma_m**2 * torch.eye(3).to(station)
     information = torch.linalg.inv(covariance)
@@ -223,12 +130,12 @@ def align_journeys(
         corrected = measured - bias_at(bias, members.journey, station, measured)
         squared = mahalanobis(corrected - place[label], covariance)
         # Before the biases are found everything misses: the scale starts wide and narrows by itself.
-        scale = (squared.median() / _CHI_SQUARE_MEDIAN).clamp_min(1)
+        scale = scale_of_misses(squared)
         trust = Tukey().weight(squared / scale)
         trusted = information * trust.clamp_min(1e-4)[:, None, None]
         place = _places(corrected, say * trusted, label, clusters)
         before = bias
-        bias = _bias_given_places(
+        bias = bias_given_places(
             bias, members, station, place[label], trusted, bias_sigma, positioning
         )
         shift = group_sum(gauge * bias.translation, component, journeys)
@@ -239,6 +146,11 @@ def align_journeys(
     return replace(bias, shared_covariance=shared)
 
 
+def scale_of_misses(squared: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+    """How far squared misses of places, in their standard deviations, are above what these say: 1 at least."""
+    return (squared.median() / _CHI_SQUARE_MEDIAN).clamp_min(1)
+
+
 def mean_differences(
     signs: Signs, label: Int[Tensor, " n"], station: Float[Tensor, " n"], start: JourneyBias
 ) -> JourneyBias:
@@ -247,7 +159,7 @@ def mean_differences(
     Everybody's mean of a cluster is that of its members with the biases of `start` taken off; those are zero where the
     paper is followed.
     """
-    used = _in_shared_clusters(signs.journey, label)
+    used = in_shared_clusters(signs.journey, label)
     members, label, station = signs[used], label[used], station[used]
     measured = members.center_world
     clusters = int(label.max()) + 1 if len(label) else 0
@@ -279,128 +191,7 @@ def _places(
     return torch.linalg.solve(total, right)
 
 
-def _bias_given_places(
-    bias: JourneyBias,
-    members: Signs,
-    station: Float[Tensor, " n"],
-    place: Float[Tensor, "n 3"],
-    information: Float[Tensor, "n 3 3"],
-    bias_sigma: Float[Tensor, "j 3"],
-    positioning: PositioningNoise,
-) -> JourneyBias:
-    """Translation, heading and drift of all journeys at once, the places of the clusters given.
-
-    The drift's nodes form a chain in each journey, with how the bias wanders beside the drift where there is a long one.
-    They are eliminated by one banded solve over the nodes of all journeys (no entry couples two journeys); four unknowns a
-    journey remain.
-    """
-    J, K = len(bias), len(bias.node_drift)
-    journey = members.journey
-    measured = members.center_world
-    node, along = _node_at(bias, journey, station)
-    lever = _lever(measured - bias.centroid[journey])
-    eye = torch.eye(3).to(lever).expand(len(journey), 3, 3)
-    B = torch.cat((eye, lever[..., None], (measured - place)[..., None]), dim=2)  # [n, 3, 4 + 1]
-    WB = information @ B
-
-    diagonal, below = _node_prior(bias, bias_sigma, positioning)
-    parts = diagonal.shape[1] // 3
-    # Whatever a node's state consists of, what is seen is its sum.
-    of_sum = information.repeat(1, parts, parts)
-    a, WB_sum = along[:, None, None], WB.repeat(1, parts, 1)
-    diagonal = diagonal.index_add(0, node, (1 - a).square() * of_sum)
-    diagonal = diagonal.index_add(0, node + 1, a.square() * of_sum)
-    below = below.index_add(0, node, a * (1 - a) * of_sum)
-    right = WB.new_zeros(K, 3 * parts, 5).index_add(0, node, (1 - a) * WB_sum)
-    right = right.index_add(0, node + 1, a * WB_sum)
-    solved = _solve_chain(diagonal, below, right)
-
-    owner = bias.journey_of_node
-    border = B[..., :4].mT @ WB
-    schur = WB.new_zeros(J, 4, 5).index_add(0, journey, border)
-    schur = schur.index_add(0, owner, -right[..., :4].mT @ solved)
-    # What turns with the car leaves no mark on where it is kilometres ahead.
-    short = (LEAST_SHARE * positioning.wander_length_m / bias.length).clamp_max(1)
-    heading_sigma = positioning.bias_sigma_rad * short[:, None]
-    prior = torch.diag_embed(torch.cat((bias_sigma, heading_sigma), dim=1).pow(-2))
-    inverse = torch.linalg.inv(schur[..., :4] + prior)
-    constant = (inverse @ schur[..., 4:])[..., 0]
-    drift = solved[..., 4] - (solved[..., :4] @ constant[owner, :, None])[..., 0]
-    drift, *wander = drift.split(3, dim=1)
-    node_wander = wander[0] if wander else torch.zeros_like(drift)
-    return replace(
-        bias,
-        translation=constant[:, :3],
-        heading=constant[:, 3],
-        covariance=inverse[:, :3, :3],
-        node_drift=drift + node_wander,
-        node_wander=node_wander,
-    )
-
-
-def _node_prior(
-    bias: JourneyBias, bias_sigma: Float[Tensor, "j 3"], positioning: PositioningNoise
-) -> tuple[Float[Tensor, "k s s"], Float[Tensor, "k s s"]]:
-    """Information of the nodes' states: diagonal blocks, and those between a node and the next."""
-    drift = torch.full_like(bias_sigma, positioning.drift_sigma_m)
-    chains = [_chain_prior(bias, drift, positioning.drift_length_m)]
-    is_long = bias.length >= LEAST_SHARE * positioning.wander_length_m
-    if positioning.wander_sigma_m and bool(is_long.any()):
-        # By how much it wanders shows in the adjustment: of what is known of the bias all but little may.
-        sigma = torch.where(is_long[:, None], WANDER_SHARE**0.5 * bias_sigma, _AT_REST_M)
-        chains.append(_chain_prior(bias, sigma, positioning.wander_length_m))
-    diagonal, between = (torch.cat(part, dim=1) for part in zip(*chains, strict=True))
-    return torch.diag_embed(diagonal), torch.diag_embed(between)
-
-
-def _chain_prior(
-    bias: JourneyBias, sigma: Float[Tensor, "j 3"], length_m: float
-) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
-    """Information of an Ornstein-Uhlenbeck chain by axis: of every node, and between it and the next."""
-    owner = bias.journey_of_node
-    decay = torch.exp(-bias.node_spacing / length_m)[owner, None]
-    variance = sigma[owner].square()
-    step = 1 / (variance * (1 - decay.square()))
-    rank = torch.arange(len(owner), device=owner.device) - bias.node_start[owner]
-    is_first = (rank == 0)[:, None]
-    is_last = (rank == bias.node_count[owner] - 1)[:, None]
-    # A chain without its first step is stationary: sigma^-2 at the first node, decay^2 more where a step leaves a node.
-    into = torch.where(is_first, 1 / variance, step)
-    out = torch.where(is_last, 0.0, decay.square() * step)
-    return into + out, torch.where(is_last, 0.0, -decay * step)
-
-
-def _solve_chain(
-    diagonal: Float[Tensor, "k s s"], below: Float[Tensor, "k s s"], right: Float[Tensor, "k s m"]
-) -> Float[Tensor, "k s m"]:
-    """Solution of a symmetric block-tridiagonal system; `below[k]` couples k and k + 1 and is symmetric."""
-    K, s = diagonal.shape[:2]
-    lower = diagonal.new_zeros(K, s, 2 * s)
-    for column in range(s):
-        lower[:, column, : s - column] = diagonal[:, column:, column]
-        lower[:, column, s - column : 2 * s - column] = below[:, :, column]
-    factor = cholesky_banded(lower.view(s * K, 2 * s))
-    if factor is None:
-        raise ArithmeticError("a chain of biases without a prior")
-    return factor.solve(right.reshape(s * K, -1)).reshape(right.shape)
-
-
-def _node_at(
-    bias: JourneyBias, journey: Int[Tensor, " n"], station: Float[Tensor, " n"]
-) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"]]:
-    """The node before each station, and how far along to the next it is, 0 to 1."""
-    position = (station - bias.node_origin[journey]) / bias.node_spacing[journey]
-    last = (bias.node_count[journey] - 2).to(position)
-    rank = position.floor().clamp_min(0).minimum(last)
-    return bias.node_start[journey] + rank.long(), (position - rank).clamp(0, 1)
-
-
-def _lever(arm: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Displacement of a place per radian of heading: up x arm."""
-    return torch.stack((-arm[:, 1], arm[:, 0], torch.zeros_like(arm[:, 0])), dim=1)
-
-
-def _in_shared_clusters(journey: Int[Tensor, " n"], label: Int[Tensor, " n"]) -> Tensor:
+def in_shared_clusters(journey: Int[Tensor, " n"], label: Int[Tensor, " n"]) -> Tensor:
     """True for members of clusters that two or more journeys are in; others say nothing about biases."""
     used = label >= 0
     groups = int(label.max()) + 1 if len(label) else 0

@@ -11,14 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.spectral import renumber
-from crowdmap_torch.crowd_signs.align import (
-    AlignConfig,
-    JourneyBias,
-    align_journeys,
-    bias_at,
-    largest_drift,
-    no_bias,
-)
+from crowdmap_torch.crowd_signs.align import AlignConfig, align_journeys, no_bias
 from crowdmap_torch.crowd_signs.cluster import (
     SignClusterConfig,
     Spectrum,
@@ -40,6 +33,7 @@ from crowdmap_torch.crowd_signs.gather import (
     unexplained_covariance,
     with_covariance,
 )
+from crowdmap_torch.crowd_signs.journey_bias import JourneyBias, bias_at, largest_drift
 from crowdmap_torch.crowd_signs.match import (
     HeadMatchConfig,
     join_leftovers,
@@ -70,6 +64,7 @@ from crowdmap_torch.crowd_signs.outlier_journeys import (
 from crowdmap_torch.crowd_signs.rounds import CrowdRound, crowd_round
 from crowdmap_torch.crowd_signs.stretches import first_biases
 from crowdmap_torch.crowd_signs.vote import VoteConfig
+from crowdmap_torch.crowd_signs.wander_length import likely_wander
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.ranges import FILLED, Count, Rounds, Settings, Share, Sigma, Spacing
@@ -158,6 +153,8 @@ class Crowd:
     share.
     """
     bias: JourneyBias
+    positioning: PositioningNoise
+    """What positioning gets wrong, with the size of biases and the way on which they wander as these signs tell them."""
     displaced: Bool[Tensor, " n"]
     """Members that are signs of the others, beside their places."""
     journey_weight: Float[Tensor, " j"]
@@ -223,19 +220,8 @@ def _register_paper(
     )
     weight = crowd.bias_sigma.new_ones(crowd.journeys)
     rounds = [crowd_round(0.0, torch.full_like(label, -1), label)]
-    made = _finished(
-        crowd,
-        label,
-        heads,
-        bias,
-        (),
-        weight,
-        rounds,
-        found.spectra,
-        statistics,
-        positioning,
-        config,
-    )
+    told = (), weight, rounds, found.spectra, statistics
+    made = _finished(crowd, label, heads, bias, *told, positioning, config)
     # Every cluster is in the map: the paper asks nobody who drove by and saw nothing.
     return replace(made, heads=heads)
 
@@ -247,8 +233,10 @@ def _register_joint(
     generator: torch.Generator,
 ) -> Crowd:
     signs, journeys = crowd.signs, crowd.journeys
-    found = first_biases(crowd, positioning, config.align, config.vote, generator=generator)
-    bias, crowd = found[0], replace(crowd, bias_sigma=found[1])
+    bias, larger = first_biases(crowd, positioning, config.align, config.vote, generator=generator)
+    crowd = replace(crowd, bias_sigma=larger * crowd.bias_sigma)
+    east, north, up = (larger * larger.new_tensor(positioning.bias_sigma_m)).tolist()
+    positioning = replace(positioning, bias_sigma_m=(east, north, up))
     weight = crowd.bias_sigma.new_ones(journeys)
     label = torch.full_like(signs.journey, -1)
     rounds: list[CrowdRound] = []
@@ -272,6 +260,9 @@ def _register_joint(
             )
             spectra = spectra or spectrum
             rounds.append(crowd_round(shift_sigma, before, label))
+            if len(rounds) == 1:
+                known = extra, label, positioning, config.align
+                positioning = likely_wander(crowd, *known, start=bias)
             bias = align_journeys(
                 with_covariance(signs, extra),
                 label,
@@ -302,21 +293,9 @@ def _register_joint(
     label, heads, outages, displaced = _without_outages(
         crowd, unbiased, label, weight[signs.journey], config
     )
-    return _finished(
-        crowd,
-        label,
-        heads,
-        bias,
-        outliers,
-        weight,
-        rounds,
-        spectra,
-        statistics,
-        positioning,
-        config,
-        outages=outages,
-        displaced=displaced,
-    )
+    told = outliers, weight, rounds, spectra, statistics
+    found = crowd, label, heads, bias, *told, positioning, config
+    return _finished(*found, outages=outages, displaced=displaced)
 
 
 def _regroup(
@@ -437,6 +416,7 @@ def _finished(
         heads=replace(heads, confidence=confidence),
         tentative=replace(tentative, confidence=torch.minimum(low, tentative.confidence)),
         bias=bias,
+        positioning=positioning,
         displaced=torch.zeros_like(label, dtype=torch.bool) if displaced is None else displaced,
         journey_weight=weight,
         report=CrowdReport(

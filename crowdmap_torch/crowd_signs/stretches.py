@@ -9,23 +9,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.crowd_signs.align import AlignConfig, JourneyBias, no_bias
+from crowdmap_torch.crowd_signs.align import AlignConfig, no_bias
+from crowdmap_torch.crowd_signs.cluster import moved
 from crowdmap_torch.crowd_signs.gather import CrowdSigns
+from crowdmap_torch.crowd_signs.journey_bias import JourneyBias, bias_at
 from crowdmap_torch.crowd_signs.vote import VoteConfig, vote_biases
 from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
 from crowdmap_torch.noise.positioning import PositioningNoise
-from crowdmap_torch.optim.robust import median_along, median_scale
+from crowdmap_torch.optim.robust import median_along
 
 _STRETCH = 1 / 10
 """Of the way on which a bias forgets where it was: the most that it is taken to stand still over."""
 _FREE = 3.0
 """Biases are first looked for as if they were this many times as large as expected."""
-_FARTHER = 2.0
-"""... and shifts between drives this many times as far."""
-_LARGER = 1.5
-"""Where those found are larger than expected by this factor along any axis, they stand ..."""
-_CHANCE = 4
-"""... and by more where drives are few: of so many, by twice as much."""
+_LEFT_M = 2.0
+"""1-sigma of what a stretch may be off by beyond its drive [m]."""
+_SHORT_M = 375.0
+"""Ways of which a tenth is such a stretch [m]."""
+_EXPECTED = 4.0
+"""What is expected of biases counts as much as so many drives."""
 
 
 def first_biases(
@@ -35,23 +37,32 @@ def first_biases(
     config: VoteConfig,
     *,
     generator: torch.Generator,
-) -> tuple[JourneyBias, Float[Tensor, "j 3"]]:
-    """The biases that `vote_by_stretch` finds, and 1-sigma of how large they may be, as wide as these are [m].
+) -> tuple[JourneyBias, Float[Tensor, " 3"]]:
+    """The biases that `vote_by_stretch` finds, and how many times as large as expected they are, at least one, by axis.
 
-    Shifts of many times what is expected lose the vote to wrong ones between neighbours: a drive is placed beside all
-    others, where its signs are nobody's or seem to be displaced. So a vote comes first that leaves biases free.
+    Shifts of more than what is expected lose the vote to wrong ones between neighbours: a drive is placed beside all
+    others, where its signs are nobody's or seem to be displaced. So biases are free in a vote of whole drives; what is
+    left is voted on stretch by stretch, as it may change along a drive by more than a drift is expected to.
     """
     start = no_bias(crowd.signs, crowd.station, positioning, align, journeys=crowd.journeys)
-    same = torch.Generator().set_state(generator.get_state())
     free = replace(crowd, bias_sigma=_FREE * crowd.bias_sigma)
-    far = replace(config, radius_m=_FARTHER * config.radius_m, height_m=_FARTHER * config.height_m)
-    found = vote_by_stretch(free, start, positioning, far, generator=same)
+    found = vote_by_stretch(free, start, positioning, config, generator=generator)
     away = (found.translation - median_along(found.translation, 0)) / crowd.bias_sigma
-    least = _LARGER * (1 + _CHANCE / max(crowd.journeys, 1))
-    if any(float(median_scale(axis)) > least for axis in away.unbind(1)):
-        return found, free.bias_sigma
-    found = vote_by_stretch(crowd, start, positioning, config, generator=generator)
-    return found, crowd.bias_sigma
+    # One that is further off than the free vote is for says no more of the others.
+    square = away.clamp(-_FREE, _FREE).square().sum(0)
+    larger = ((_EXPECTED + square) / (_EXPECTED + crowd.journeys)).sqrt().clamp_min(1)
+    signs = crowd.signs
+    rest = moved(signs, -bias_at(found, signs.journey, crowd.station, signs.center_world))
+    left = replace(crowd, signs=rest, bias_sigma=torch.full_like(free.bias_sigma, _LEFT_M))
+    short = replace(positioning, wander_length_m=_SHORT_M)
+    wide = replace(config, outlier_m=max(config.outlier_m, _LEFT_M))
+    more = vote_by_stretch(left, start, short, wide, generator=generator)
+    found = replace(
+        found,
+        translation=found.translation + more.translation,
+        node_drift=found.node_drift + more.node_drift,
+    )
+    return found, larger
 
 
 def vote_by_stretch(

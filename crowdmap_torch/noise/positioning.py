@@ -48,7 +48,8 @@ class PositioningNoise(Settings):
     """How far the bias of the position wanders on long drives [m]; each journey's own scale is estimated from there. 0: it
     does not."""
     wander_length_m: Length = 3000.0
-    """Way over which its correlation falls to 1/e [m]. Drives of half of that wander; from a fifth on where they show it."""
+    """Way over which its correlation falls to 1/e [m]. Drives of half of that wander; from a fifth on where they show it.
+    The signs of a crowd may tell that it is a half, a quarter or an eighth of this: that is taken then."""
     drift_sigma_m: Sigma = 0.25
     """Slow error of the position [m]; with it the paper's method ends near the paper's relative error (docs/RESULTS.md)."""
     drift_length_m: Length = 150.0

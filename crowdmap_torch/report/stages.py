@@ -69,6 +69,7 @@ def log_crowd(log: TensorBoardLog, dataset: Dataset, first: FirstMap) -> None:
         # As in metrics.json: what is to be added to the given positions, in the mean along the way.
         bias = dict(zip(("east", "north", "up"), drift[:, :3].mean(0).tolist(), strict=True))
         log.log_scalars({f"bias/{axis}_m": value for axis, value in bias.items()}, number)
+    log.log_scalars({"bias/wander_length_m": first.crowd.positioning.wander_length_m}, 0)
     bad = (*dataset.rejected, *outlier_journeys_of(dataset, first), *outages_of(dataset, first))
     log.log_text("bad_drives", "\n".join(f"{j.journey_id}: {j.reason}" for j in bad) or "none")
 

@@ -56,6 +56,7 @@ def metrics_of(
         "rejected_journeys": plain(dataset.rejected),
         "suspect_journeys": plain(outlier_journeys_of(dataset, result.first)),
         "outages": plain(outages_of(dataset, result.first)),
+        "wander_length_m": result.first.crowd.positioning.wander_length_m,
         "journeys": [
             {
                 "journey_id": s.journey_id,

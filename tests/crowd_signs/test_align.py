@@ -8,13 +8,11 @@ import pytest
 import torch
 from worlds.crowd_world import World, make_world
 
-from crowdmap_torch.crowd_signs.align import (
-    AlignConfig,
+from crowdmap_torch.crowd_signs.align import AlignConfig, align_journeys, no_bias
+from crowdmap_torch.crowd_signs.journey_bias import (
     JourneyBias,
-    align_journeys,
     bias_at,
     largest_drift,
-    no_bias,
     unbiased_poses,
 )
 from crowdmap_torch.geometry import se3

@@ -253,3 +253,27 @@ def turned_round(signs: Signs) -> Signs:
     """The same signs seen from behind: facing the other way."""
     half = torch.diag(torch.tensor([-1.0, 1, -1, 1])).double()
     return replace(signs, T_world_sign=signs.T_world_sign @ half)
+
+
+def wandering_world(
+    seed: int,
+    *,
+    wander_m: float,
+    length_m: float = 2000.0,
+    bias_sigma_m: float = 1.5,
+    ghosts: float = 0.05,
+) -> World:
+    """Six drives whose bias goes from one side to the other: by twice `wander_m` from end to end."""
+    world = make_world(
+        seed, journeys=6, length_m=length_m, posts=round(0.03 * length_m), bias_m=0.5, ghosts=ghosts
+    )
+    crowd = world.crowd
+    phase = torch.arange(6).double()[crowd.signs.journey]
+    angle = torch.pi * (crowd.station / length_m - 0.5) + 2 * phase
+    wander = wander_m * torch.stack((angle.sin(), (angle + 1).sin(), 0 * angle), dim=1)
+    T = crowd.signs.T_world_sign.clone()
+    T[:, :3, 3] += wander
+    signs = replace(crowd.signs, T_world_sign=T)
+    sigma = torch.full_like(crowd.bias_sigma, bias_sigma_m)
+    crowd = replace(crowd, signs=signs, bias_sigma=sigma)
+    return replace(world, crowd=crowd, error=world.error + wander)
