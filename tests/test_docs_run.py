@@ -127,6 +127,7 @@ SMALLER: Mapping[str, str] = {
     "crowdmap benchmark journey DATASET --endless 4": "--endless 0.001",
     "python scripts/soak.py mistakes": "--sets street --only w-x-y-z",
     # A street with six signs, in 13 s; ten worlds take eight minutes.
+    "python scripts/soak.py worlds --wide": "--first 40 --count 1",
     "python scripts/soak.py worlds": "--first 1551 --count 1",
     # It would serve until it is ended.
     "tensorboard": "--inspect",

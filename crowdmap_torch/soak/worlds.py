@@ -20,6 +20,7 @@ import numpy as np
 from numpy.random import Generator
 
 from crowdmap_torch.cli import main
+from crowdmap_torch.soak.wide_worlds import drawn_wide_world
 
 _RECALL, _PRECISION = 0.95, 0.9
 """Least of the signs that can be seen, and of those of the map, that are to be found and right."""
@@ -40,6 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `soak worlds` takes."""
     parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first")
     parser.add_argument("--count", type=int, default=10, metavar="N", help="how many")
+    parser.add_argument(
+        "--wide",
+        action="store_true",
+        help="of all that the simulator has, cities and bad drives too",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -48,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
     bad = 0
     with tempfile.TemporaryDirectory(prefix="soak-") as temporary:
         for number in range(options.first, options.first + options.count):
-            drawn = drawn_world(number)
+            drawn = drawn_wide_world(number) if options.wide else drawn_world(number)
             figures = _figures(drawn, Path(temporary) / str(number))
             held = figures is not None and _holds(figures)
             print(_line(number, drawn, figures), flush=True)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from crowdmap_torch.commands import simulate
 from crowdmap_torch.soak import worlds
+from crowdmap_torch.soak.wide_worlds import drawn_wide_world
+
+DRAWN = (worlds.drawn_world, drawn_wide_world)
 
 FOUND = {
     "signs": {
@@ -42,20 +46,37 @@ def written(figures: dict | None):
     return main
 
 
-def told(number: int) -> int:
-    return worlds.run(argparse.Namespace(first=number, count=1))
+def told(number: int, *, wide: bool = False) -> int:
+    return worlds.run(argparse.Namespace(first=number, count=1, wide=wide))
 
 
-def test_a_world_is_the_same_by_its_number():
-    assert worlds.drawn_world(7) == worlds.drawn_world(7) != worlds.drawn_world(8)
+@pytest.mark.parametrize("drawn", DRAWN)
+def test_a_world_is_the_same_by_its_number(drawn: Callable[[int], list[str]]):
+    assert drawn(7) == drawn(7) != drawn(8)
 
 
-def test_the_simulator_takes_every_world():
+@pytest.mark.parametrize("drawn", DRAWN)
+def test_the_simulator_takes_every_world(drawn: Callable[[int], list[str]]):
+    # A parser's options take 40 ms to make, and are the same for all.
+    parser = argparse.ArgumentParser()
+    simulate.add_arguments(parser)
     for number in range(200):
-        parser = argparse.ArgumentParser()
-        simulate.add_arguments(parser)
-        given = parser.parse_args(["data", *worlds.drawn_world(number)])
+        given = parser.parse_args(["data", *drawn(number)])
         assert given.seed == number
+
+
+def test_wide_worlds_have_what_others_lack():
+    every = [word for number in range(100) for word in drawn_wide_world(number)]
+    for word in ("city", "--bad-drives", "--outages", "--bias-wander-m", "--jitter-px"):
+        assert 5 < every.count(word) < 60, word
+    width = [drawn[drawn.index("--width") + 1] for drawn in map(drawn_wide_world, range(100))]
+    assert {*width} == {"640", "1280", "1920", "3840"}
+
+
+def test_wide_worlds_are_mapped_where_they_are_asked_for(monkeypatch, capsys):
+    monkeypatch.setattr(worlds, "main", written(FOUND))
+    assert told(20, wide=True) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith("  20 highway  pinhole 3840  5 Hz")
 
 
 def test_a_good_map_is_a_line(monkeypatch, capsys):
