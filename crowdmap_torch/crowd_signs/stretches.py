@@ -1,4 +1,4 @@
-"""V-B, unlike the paper: how large biases are, and the first ones, of long drives by a vote for every few kilometres."""
+"""V-B, unlike the paper: how large biases are, and the first ones, by votes on whole drives and on stretches of them."""
 
 from __future__ import annotations
 
