@@ -17,15 +17,18 @@ from crowdmap_torch.mapper import FirstMap, MapResult, adjusted_map, build_bundl
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.tables import Dataset
 
-WANDERING = MapperConfig(positioning=PositioningNoise(wander_length_m=200.0))
+WANDERING = PositioningNoise(wander_length_m=200.0)
 """As if a drive of this length were a long one."""
-STEADY = MapperConfig(positioning=PositioningNoise(wander_sigma_m=0.0))
+STEADY = PositioningNoise(wander_sigma_m=0.0)
 
 
 def built(
-    tiny: Dataset, tiny_result: MapResult, first: FirstMap, config: MapperConfig | None = None
+    tiny: Dataset, tiny_result: MapResult, first: FirstMap, told: PositioningNoise | None = None
 ) -> Bundle:
-    return build_bundle(tiny.journeys, tiny_result.journey_maps, first, config or MapperConfig())
+    """`told`: what the crowd's signs tell of positioning."""
+    if told is not None:
+        first = replace(first, crowd=replace(first.crowd, positioning=told))
+    return build_bundle(tiny.journeys, tiny_result.journey_maps, first, MapperConfig())
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +107,7 @@ def test_stretches_that_nobody_knew_have_the_drift_beside_them(
 
 @pytest.mark.parametrize(("before", "after"), [(STEADY, WANDERING), (WANDERING, STEADY)])
 def test_biases_that_turn_out_to_wander_or_not_to_take_what_both_know(
-    tiny, tiny_result: MapResult, before: MapperConfig, after: MapperConfig
+    tiny, tiny_result: MapResult, before: PositioningNoise, after: PositioningNoise
 ):
     bundle = built(tiny, tiny_result, tiny_result.first, before)
     first = anew(tiny, tiny_result.first, bundle)
