@@ -13,7 +13,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_median, group_sum
 from crowdmap_torch.crowd_signs.distance import mahalanobis
-from crowdmap_torch.crowd_signs.journey_bias import JourneyBias, bias_at, bias_given_places
+from crowdmap_torch.crowd_signs.journey_bias import BiasEquations, JourneyBias, bias_at
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.ranges import Rounds, Settings, Share, Sigma, Spacing
@@ -135,9 +135,8 @@ def align_journeys(
         trusted = information * trust.clamp_min(1e-4)[:, None, None]
         place = _places(corrected, say * trusted, label, clusters)
         before = bias
-        bias = bias_given_places(
-            bias, members, station, place[label], trusted, bias_sigma, positioning
-        )
+        given = members, station, place[label], trusted, bias_sigma, positioning
+        bias = BiasEquations.of(bias, *given).most_likely()
         shift = group_sum(gauge * bias.translation, component, journeys)
         mean = shift / group_sum(gauge, component, journeys).clamp_min(1e-300)
         bias = replace(bias, translation=bias.translation - mean[component])

@@ -111,116 +111,102 @@ def unbiased_poses(
     )
 
 
-def bias_given_places(
-    bias: JourneyBias,
-    members: Signs,
-    station: Float[Tensor, " n"],
-    place: Float[Tensor, "n 3"],
-    information: Float[Tensor, "n 3 3"],
-    bias_sigma: Float[Tensor, "j 3"],
-    positioning: PositioningNoise,
-) -> JourneyBias:
-    """Translation, heading and drift of all journeys at once, the places of the clusters given.
-
-    `bias` says where the drives' nodes are; what it knows of their biases is of no account.
-    """
-    given = members, station, place, information, bias_sigma, positioning
-    equations = _eliminate(bias, *given)
-    inverse = torch.linalg.inv(equations.schur[..., :4, :4])
-    constant = (inverse @ equations.schur[..., :4, 4:])[..., 0]
-    owner, solved = bias.journey_of_node, equations.solved
-    drift = solved[..., 4] - (solved[..., :4] @ constant[owner, :, None])[..., 0]
-    drift, *wander = drift.split(3, dim=1)
-    node_wander = wander[0] if wander else torch.zeros_like(drift)
-    return replace(
-        bias,
-        translation=constant[:, :3],
-        heading=constant[:, 3],
-        covariance=inverse[:, :3, :3],
-        node_drift=drift + node_wander,
-        node_wander=node_wander,
-    )
-
-
-def log_evidence(
-    bias: JourneyBias,
-    members: Signs,
-    station: Float[Tensor, " n"],
-    place: Float[Tensor, "n 3"],
-    information: Float[Tensor, "n 3 3"],
-    bias_sigma: Float[Tensor, "j 3"],
-    positioning: PositioningNoise,
-) -> Float[Tensor, " j"]:
-    """Log-likelihood of each journey's signs, all that its poses may have wrong marginalised, the places given.
-
-    But for what the priors have no part in: only differences between priors mean something.
-    """
-    given = members, station, place, information, bias_sigma, positioning
-    equations = _eliminate(bias, *given)
-    lower = torch.linalg.cholesky(equations.schur[..., :4, :4])
-    missed = torch.linalg.solve_triangular(lower, equations.schur[..., :4, 4:], upper=False)
-    square = equations.schur[:, 4, 4] - missed.square().sum((1, 2))
-    schur = 2 * lower.diagonal(dim1=1, dim2=2).log().sum(1)
-    prior = equations.prior.log().sum(1)
-    chain = _chain_log_determinant(bias, equations.chain)
-    own = _solver(*_node_prior(bias, bias_sigma, positioning))
-    return -0.5 * (square + schur - prior + chain - _chain_log_determinant(bias, own))
-
-
 @dataclass(frozen=True)
-class _Equations:
-    """Normal equations of biases and headings, the drifts' nodes eliminated; the last column is the right-hand side."""
+class BiasEquations:
+    """What signs say of all that journeys' poses have wrong, the places of their clusters given; drifts are eliminated.
 
+    The last column is the right-hand side.
+    """
+
+    bias: JourneyBias
+    """Where the drives' nodes are; what it knows of their biases is of no account."""
     schur: Float[Tensor, "j 5 5"]
-    """With the prior in its first four rows."""
+    """Of translation and heading, with the prior in its first four rows."""
     prior: Float[Tensor, "j 4"]
-    """Information."""
+    """Information on them."""
     solved: Float[Tensor, "k s 5"]
     """The nodes' own equations solved for those columns."""
     chain: BandFactor
     """Of the nodes' equations."""
+    node_prior: tuple[Float[Tensor, "k s s"], Float[Tensor, "k s s"]]
+    """Information on the nodes: diagonal blocks, and those between a node and the next."""
 
+    @classmethod
+    def of(
+        cls,
+        bias: JourneyBias,
+        members: Signs,
+        station: Float[Tensor, " n"],
+        place: Float[Tensor, "n 3"],
+        information: Float[Tensor, "n 3 3"],
+        bias_sigma: Float[Tensor, "j 3"],
+        positioning: PositioningNoise,
+    ) -> BiasEquations:
+        """Of all journeys at once: no entry couples two. How biases wander is beside the drift where one does."""
+        J, K = len(bias), len(bias.node_drift)
+        journey = members.journey
+        measured = members.center_world
+        node, along = _node_at(bias, journey, station)
+        lever = _lever(measured - bias.centroid[journey])
+        eye = torch.eye(3).to(lever).expand(len(journey), 3, 3)
+        B = torch.cat(
+            (eye, lever[..., None], (measured - place)[..., None]), dim=2
+        )  # [n, 3, 4 + 1]
+        WB = information @ B
 
-def _eliminate(
-    bias: JourneyBias,
-    members: Signs,
-    station: Float[Tensor, " n"],
-    place: Float[Tensor, "n 3"],
-    information: Float[Tensor, "n 3 3"],
-    bias_sigma: Float[Tensor, "j 3"],
-    positioning: PositioningNoise,
-) -> _Equations:
-    """Of the nodes of all journeys at once: no entry couples two. How biases wander is beside the drift where one does."""
-    J, K = len(bias), len(bias.node_drift)
-    journey = members.journey
-    measured = members.center_world
-    node, along = _node_at(bias, journey, station)
-    lever = _lever(measured - bias.centroid[journey])
-    eye = torch.eye(3).to(lever).expand(len(journey), 3, 3)
-    B = torch.cat((eye, lever[..., None], (measured - place)[..., None]), dim=2)  # [n, 3, 4 + 1]
-    WB = information @ B
+        node_prior = diagonal, below = _node_prior(bias, bias_sigma, positioning)
+        parts = diagonal.shape[1] // 3
+        # Whatever a node's state consists of, what is seen is its sum.
+        of_sum = information.repeat(1, parts, parts)
+        a, WB_sum = along[:, None, None], WB.repeat(1, parts, 1)
+        diagonal = diagonal.index_add(0, node, (1 - a).square() * of_sum)
+        diagonal = diagonal.index_add(0, node + 1, a.square() * of_sum)
+        below = below.index_add(0, node, a * (1 - a) * of_sum)
+        right = WB.new_zeros(K, 3 * parts, 5).index_add(0, node, (1 - a) * WB_sum)
+        right = right.index_add(0, node + 1, a * WB_sum)
+        chain = _solver(diagonal, below)
+        solved = chain.solve(right.reshape(3 * parts * K, -1)).reshape(right.shape)
 
-    diagonal, below = _node_prior(bias, bias_sigma, positioning)
-    parts = diagonal.shape[1] // 3
-    # Whatever a node's state consists of, what is seen is its sum.
-    of_sum = information.repeat(1, parts, parts)
-    a, WB_sum = along[:, None, None], WB.repeat(1, parts, 1)
-    diagonal = diagonal.index_add(0, node, (1 - a).square() * of_sum)
-    diagonal = diagonal.index_add(0, node + 1, a.square() * of_sum)
-    below = below.index_add(0, node, a * (1 - a) * of_sum)
-    right = WB.new_zeros(K, 3 * parts, 5).index_add(0, node, (1 - a) * WB_sum)
-    right = right.index_add(0, node + 1, a * WB_sum)
-    chain = _solver(diagonal, below)
-    solved = chain.solve(right.reshape(3 * parts * K, -1)).reshape(right.shape)
+        schur = WB.new_zeros(J, 5, 5).index_add(0, journey, B.mT @ WB)
+        schur = schur.index_add(0, bias.journey_of_node, -right.mT @ solved)
+        # What turns with the car leaves no mark on where it is kilometres ahead.
+        short = (LEAST_SHARE * positioning.wander_length_m / bias.length).clamp_max(1)
+        heading_sigma = positioning.bias_sigma_rad * short[:, None]
+        prior = torch.cat((bias_sigma, heading_sigma), dim=1).pow(-2)
+        schur[:, range(4), range(4)] += prior
+        return cls(bias, schur, prior, solved, chain, node_prior)
 
-    schur = WB.new_zeros(J, 5, 5).index_add(0, journey, B.mT @ WB)
-    schur = schur.index_add(0, bias.journey_of_node, -right.mT @ solved)
-    # What turns with the car leaves no mark on where it is kilometres ahead.
-    short = (LEAST_SHARE * positioning.wander_length_m / bias.length).clamp_max(1)
-    heading_sigma = positioning.bias_sigma_rad * short[:, None]
-    prior = torch.cat((bias_sigma, heading_sigma), dim=1).pow(-2)
-    schur[:, range(4), range(4)] += prior
-    return _Equations(schur, prior, solved, chain)
+    def most_likely(self) -> JourneyBias:
+        """Translation, heading and drift of all journeys."""
+        bias, solved = self.bias, self.solved
+        inverse = torch.linalg.inv(self.schur[..., :4, :4])
+        constant = (inverse @ self.schur[..., :4, 4:])[..., 0]
+        owner = bias.journey_of_node
+        drift = solved[..., 4] - (solved[..., :4] @ constant[owner, :, None])[..., 0]
+        drift, *wander = drift.split(3, dim=1)
+        node_wander = wander[0] if wander else torch.zeros_like(drift)
+        return replace(
+            bias,
+            translation=constant[:, :3],
+            heading=constant[:, 3],
+            covariance=inverse[:, :3, :3],
+            node_drift=drift + node_wander,
+            node_wander=node_wander,
+        )
+
+    def log_evidence(self) -> Float[Tensor, " j"]:
+        """Log-likelihood of each journey's signs, all that its poses may have wrong marginalised.
+
+        But for what the priors have no part in: only differences between priors mean something.
+        """
+        lower = torch.linalg.cholesky(self.schur[..., :4, :4])
+        missed = torch.linalg.solve_triangular(lower, self.schur[..., :4, 4:], upper=False)
+        square = self.schur[:, 4, 4] - missed.square().sum((1, 2))
+        schur = 2 * lower.diagonal(dim1=1, dim2=2).log().sum(1)
+        prior = self.prior.log().sum(1)
+        chain = _chain_log_determinant(self.bias, self.chain)
+        alone = _chain_log_determinant(self.bias, _solver(*self.node_prior))
+        return -0.5 * (square + schur - prior + chain - alone)
 
 
 def _chain_log_determinant(bias: JourneyBias, chain: BandFactor) -> Float[Tensor, " j"]:

@@ -23,8 +23,8 @@ from crowdmap_torch.crowd_signs.align import (
 )
 from crowdmap_torch.crowd_signs.distance import mahalanobis
 from crowdmap_torch.crowd_signs.gather import CrowdSigns, with_covariance
-from crowdmap_torch.crowd_signs.journey_bias import JourneyBias, bias_at, log_evidence
-from crowdmap_torch.noise.bias_wander import WANDER_SHARE
+from crowdmap_torch.crowd_signs.journey_bias import BiasEquations, JourneyBias, bias_at
+from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.robust import Tukey
 from crowdmap_torch.tables import Signs
@@ -53,10 +53,12 @@ def likely_wander(
     """
     signs, sigma = with_covariance(crowd.signs, covariance), positioning.wander_sigma_m
     used = in_shared_clusters(signs.journey, label)
-    if not sigma or not bool(used.any()):
+    ways = [share * positioning.wander_length_m for share in _SHARES]
+    # Over a way that no drive is long beside, none would wander: nothing would change.
+    ways = [way for way in ways if bool((start.length >= LEAST_SHARE * way).any())]
+    if not sigma or not ways or not bool(used.any()):
         return positioning
     far = max(sigma, WANDER_SHARE**0.5 * max(positioning.bias_sigma_m))
-    ways = [share * positioning.wander_length_m for share in _SHARES]
     tried = [replace(positioning, wander_length_m=way, wander_sigma_m=far) for way in ways]
     tried.insert(0, positioning)
     evidence = _evidence(crowd, signs, label, used, tried, config, start)
@@ -96,7 +98,9 @@ def _evidence(
     information = torch.linalg.inv(covariance) * trust[:, None, None]
     return torch.stack(
         [
-            log_evidence(start, members, at, place, information, sigma, positioning)
+            BiasEquations.of(
+                start, members, at, place, information, sigma, positioning
+            ).log_evidence()
             for place, positioning in zip(places, tried, strict=True)
         ]
     )

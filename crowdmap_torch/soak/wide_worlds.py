@@ -82,19 +82,19 @@ _NO_LANES = _drawn(0.15, max_lanes="of 0")
 def drawn_wide_world(number: int) -> list[str]:
     """The options of `crowdmap simulate` of a world by its number."""
     rng = np.random.default_rng([_SEED, number])
-    one_of = partial(_one_of, rng)
+    draw = partial(one_of, rng)
     kinds = ("suburb", "highway", "hills", "street", "motorway", "block", "city", "city")
-    world, journeys = one_of(kinds), int(one_of((5, 6, 8, 10, 12)))
+    world, journeys = draw(*kinds), int(draw(5, 6, 8, 10, 12))
     drawn = ["--world", world, "--journeys", str(journeys), "--seed", str(number)]
     if world == "city":
         drawn += ["--street-shift-m", "10", "--corner-shift-m", "4"]
-        drawn += ["--square-m", one_of((250, 400)), "--length-m", one_of((500, 800))]
+        drawn += ["--square-m", draw(250, 400), "--length-m", draw(500, 800)]
         drawn += _values(rng, _drawn(1, turn_share="even 0.1 0.6", street_every_m="of 100 120"), 1)
     elif world != "block":
-        drawn += ["--length-m", one_of((300, 400, 600))]
-    camera = one_of(("brown", "brown", "pinhole", "fisheye"))
-    width = int(one_of((1280, 1920, 640, 3840)))
-    height = int(width * float(one_of((0.5625, 0.75))))
+        drawn += ["--length-m", draw(300, 400, 600)]
+    camera = draw("brown", "brown", "pinhole", "fisheye")
+    width = int(draw(1280, 1920, 640, 3840))
+    height = int(width * float(draw(0.5625, 0.75)))
     drawn += ["--camera", camera, "--width", str(width), "--height", str(height)]
     drawn += ["--focal-px", str(round(width * float(_value(rng, "log 0.5 1.4", 1))))]
     rig = _drawn(
@@ -138,13 +138,19 @@ def _value(rng: Generator, text: str, width: int) -> str:
     """A value of what is drawn so, of a picture of this width."""
     how, *of = text.split()
     if how == "of":
-        return _one_of(rng, of)
+        return one_of(rng, *of)
     least, most = float(of[0]), float(of[1])
     if how == "even":
         return str(float(np.round(rng.uniform(least, most), 3)))
-    value = float(np.round(np.exp(rng.uniform(np.log(least), np.log(most))), 4))
+    value = between(rng, least, most)
     return str(value * width / _USUAL_PX if of[-1] == "px" else value)
 
 
-def _one_of(rng: Generator, choices: Sequence[float | str]) -> str:
+def one_of(rng: Generator, *choices: float | str) -> str:
+    """One of the choices, as likely as any other, as a command line has it."""
     return str(choices[int(rng.integers(len(choices)))])
+
+
+def between(rng: Generator, least: float, most: float) -> float:
+    """A number between these, log-uniform."""
+    return float(np.round(np.exp(rng.uniform(np.log(least), np.log(most))), 4))

@@ -17,10 +17,9 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-from numpy.random import Generator
 
 from crowdmap_torch.cli import main
-from crowdmap_torch.soak.wide_worlds import drawn_wide_world
+from crowdmap_torch.soak.wide_worlds import between, drawn_wide_world, one_of
 
 _RECALL, _PRECISION = 0.95, 0.9
 """Least of the signs that can be seen, and of those of the map, that are to be found and right."""
@@ -67,45 +66,37 @@ def run(options: argparse.Namespace) -> int:
 def drawn_world(number: int) -> list[str]:
     """The options of `crowdmap simulate` of a world by its number."""
     rng = np.random.default_rng([_SEED, number])
-    world = _one_of(rng, "suburb", "highway", "hills", "street", "suburb", "motorway", "block")
-    drawn = ["--world", world, "--journeys", _one_of(rng, 6, 10, 10, 15), "--seed", str(number)]
+    world = one_of(rng, "suburb", "highway", "hills", "street", "suburb", "motorway", "block")
+    drawn = ["--world", world, "--journeys", one_of(rng, 6, 10, 10, 15), "--seed", str(number)]
     if world != "block":
-        drawn += ["--length-m", _one_of(rng, 300, 400, 600)]
-    camera = _one_of(rng, "brown", "brown", "pinhole", "fisheye")
-    width = int(_one_of(rng, 1280, 1920, 640, 3840))
-    height = int(width * float(_one_of(rng, 0.5625, 0.75)))
+        drawn += ["--length-m", one_of(rng, 300, 400, 600)]
+    camera = one_of(rng, "brown", "brown", "pinhole", "fisheye")
+    width = int(one_of(rng, 1280, 1920, 640, 3840))
+    height = int(width * float(one_of(rng, 0.5625, 0.75)))
     drawn += ["--camera", camera, "--width", str(width), "--height", str(height)]
-    drawn += ["--focal-px", str(round(width * _between(rng, 0.5, 1.4)))]
-    drawn += ["--camera-height-m", str(_between(rng, 1.1, 2.6))]
+    drawn += ["--focal-px", str(round(width * between(rng, 0.5, 1.4)))]
+    drawn += ["--camera-height-m", str(between(rng, 1.1, 2.6))]
     drawn += ["--camera-pitch-deg", str(round(float(rng.uniform(-1, 6)), 2))]
-    drawn += ["--frame-rate-hz", _one_of(rng, 5, 10, 15, 30)]
+    drawn += ["--frame-rate-hz", one_of(rng, 5, 10, 15, 30)]
     # Detectors see a picture of a size of their own: their noise is so many pixels of that.
-    drawn += ["--pixel-noise-px", str(_between(rng, 0.3, 2.0) * width / 1280)]
-    drawn += ["--outliers", str(_between(rng, 0.005, 0.08))]
-    drawn += ["--missed", str(_between(rng, 0.02, 0.5))]
-    drawn += ["--lane-noise-px", str(_between(rng, 0.5, 2.5) * width / 1280)]
+    drawn += ["--pixel-noise-px", str(between(rng, 0.3, 2.0) * width / 1280)]
+    drawn += ["--outliers", str(between(rng, 0.005, 0.08))]
+    drawn += ["--missed", str(between(rng, 0.02, 0.5))]
+    drawn += ["--lane-noise-px", str(between(rng, 0.5, 2.5) * width / 1280)]
     for option, bounds in _DRAWN.items():
-        drawn += [option, str(_between(rng, *bounds))]
+        drawn += [option, str(between(rng, *bounds))]
     drawn += ["--shared-share", str(round(float(rng.uniform(0, 0.6)), 2))]
     if rng.random() < 0.3:
         drawn += ["--no-sigmas"]
     elif rng.random() < 0.5:
-        drawn += ["--sigma-scale", str(_between(rng, 0.4, 2.5))]
+        drawn += ["--sigma-scale", str(between(rng, 0.4, 2.5))]
     if rng.random() < 0.4:
-        drawn += ["--vehicles", _one_of(rng, 2, 4), "--errors", "fleet"]
+        drawn += ["--vehicles", one_of(rng, 2, 4), "--errors", "fleet"]
     if rng.random() < 0.3:
         drawn += ["--null-track", "0.5"]
     if rng.random() < 0.3:
         drawn += ["--max-lanes", "0"]
     return drawn
-
-
-def _one_of(rng: Generator, *choices: float | str) -> str:
-    return str(choices[int(rng.integers(len(choices)))])
-
-
-def _between(rng: Generator, least: float, most: float) -> float:
-    return float(np.round(np.exp(rng.uniform(np.log(least), np.log(most))), 4))
 
 
 def _figures(drawn: Sequence[str], place: Path) -> Mapping | None:

@@ -10,7 +10,7 @@ from worlds.crowd_world import World, make_world, pair_scores, wandering_world
 
 from crowdmap_torch.crowd_signs.align import AlignConfig, no_bias
 from crowdmap_torch.crowd_signs.gather import unexplained_covariance
-from crowdmap_torch.crowd_signs.journey_bias import JourneyBias, log_evidence
+from crowdmap_torch.crowd_signs.journey_bias import BiasEquations, JourneyBias
 from crowdmap_torch.crowd_signs.register import CrowdConfig, register_crowd
 from crowdmap_torch.crowd_signs.wander_length import likely_wander
 from crowdmap_torch.noise.positioning import PositioningNoise
@@ -89,7 +89,7 @@ def test_evidence_is_that_of_the_joint_normal_density():
     found, written = [], []
     for noise in tried:
         given = signs, crowd.station, place, information, crowd.bias_sigma, noise
-        found.append(log_evidence(start, *given))
+        found.append(BiasEquations.of(start, *given).log_evidence())
         written.append(_density(world, start, noise))
     assert torch.allclose(found[0] - found[1], written[0] - written[1], atol=1e-7)
 
