@@ -411,6 +411,7 @@ def finish_map(
     """
     poses = adjust.read_poses(bundle, journeys := dataset.journeys)
     uncertainty = uncertainty or map_uncertainty(bundle, first.signs, first.lanes, engine)
+    bundle.forget_factors()  # As large as all that follows.
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes, uncertainty)
     associations = first.associations
     if first.completed is not None:
@@ -422,8 +423,7 @@ def finish_map(
     roads, gate = [m.road for m in maps], config.adjust.lane_gate_m
     associations = with_lanes(associations, journeys, roads, poses, lanes, gate=gate)
     provenance = {"config": config_hash(config), "journeys": [j.journey_id for j in journeys]}
-    if dataset.bbox is not None:
-        provenance["bbox"] = [*dataset.bbox]
+    provenance |= {} if dataset.bbox is None else {"bbox": [*dataset.bbox]}
     shared = uncertainty.shared
     hd_map = as_map(dataset, signs, lanes, first.tentative, associations, shared, provenance)
     heads = first.before or replace(first, associations=associations)
@@ -437,7 +437,7 @@ def finish_map(
         uncertainty=uncertainty,
         prior_scale=bundle.prior_scale.clone(),
         white_scale=bundle.white_scale.clone(),
-        state=state,
+        state=replace(state, normal=None),
         control_points=len(bundle.fixed["control"]) if "control" in bundle.fixed else 0,
     )
 

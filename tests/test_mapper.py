@@ -93,6 +93,8 @@ def test_the_map_shows_the_street(tiny_result: MapResult, tiny_survey):
     # Three journeys with biases of 0.3 m: none of the means is a metre off.
     assert distance.max() < 1.0
     assert tiny_result.state.reasons[0].startswith("converged")
+    # The equations are as large as all else, and nobody solves them again.
+    assert tiny_result.state.normal is None
 
 
 KNOWN = replace(CONFIG, calibration=CalibrationConfig.off())

@@ -53,6 +53,7 @@ from crowdmap_torch.noise.pose_prior import MOST_NUMBERS, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.processes.at_rest import leave
 from crowdmap_torch.processes.memory import give_back
 from crowdmap_torch.residuals.lane import lane_prior, lane_stretch
 from crowdmap_torch.residuals.sign_prior import against_the_drive, habit_term, sign_place
@@ -191,8 +192,9 @@ def steps(
     end with these steps; None: all are in this process. The lenses of a bundle that is shared out follow at the end.
     """
     numbers = range(first, bundle.config.lm.max_iterations)
-    # What was read and matched has left room between what is kept.
+    # What was read and matched has left room between what is kept, and drives are not read before the map is made.
     give_back()
+    leave()
     with ExitStack() as ends:
         shared = len(bundle.convoys) > 1
         convoys = ends.enter_context(Convoys(bundle, state, engine)) if shared else None

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -169,11 +169,13 @@ class ByOptics:
         by = like.new_zeros(count, 2, k), like.new_zeros(count, heights, k)
         return cls(*by, like.new_zeros(count * heights, 3))
 
-    @classmethod
-    def of(cls, parts: Sequence[ByOptics]) -> ByOptics:
-        """Those of the rows of all parts, in order."""
-        columns = ([getattr(part, f.name) for part in parts] for f in fields(cls))
-        return cls(*map(torch.cat, columns))
+    def room(self) -> ByOptics:
+        """Memory for those of as many rows; what is in it is of no account."""
+        return ByOptics(*(of.new_empty(of.shape) for of in (self.image, self.height, self.left)))
+
+    def put(self, at: slice, some: ByOptics) -> None:
+        """Takes over those of some rows, in place."""
+        self.image[at], self.height[at], self.left[at] = some.image, some.height, some.left
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -73,21 +73,28 @@ def relinearised_at(
     first_point = len(pieces)
     pieces += [(lane_points, at) for at in _pieces(before.lane_points.frame)]
     device = values["pose"].device
-    found = list(in_order(lambda piece: piece[0](piece[1]), pieces, device, worth=1))
+    found = in_order(lambda piece: piece[0](piece[1]), pieces, device, worth=1)
+    of_corners, of_points = (
+        [at for _, at in some] for some in (pieces[:first_point], pieces[first_point:])
+    )
     return Relinearised(
-        *_joined(before.corners, before.by_corner, found[:first_point]),
-        *_joined(before.lane_points, before.by_lane_point, found[first_point:]),
+        *_joined(before.corners, before.by_corner, of_corners, found),
+        *_joined(before.lane_points, before.by_lane_point, of_points, found),
     )
 
 
 def _joined(
-    rows: Observed, by: ByOptics, pieces: Sequence[tuple[Tensor, ByOptics]]
+    rows: Observed, by: ByOptics, pieces: Sequence[slice], found: Iterator[tuple[Tensor, ByOptics]]
 ) -> tuple[Observed, ByOptics]:
-    """The rows with the matrices and derivatives of all pieces; as they are without any."""
+    """The rows with the matrices and derivatives of all pieces, which are found next; as they are without any."""
     if not pieces:
         return rows, by
-    matrices, derivatives = zip(*pieces, strict=True)
-    return replace(rows, matrix=torch.cat(matrices)), ByOptics.of(derivatives)
+    # Each goes to its place when it comes: all of them, and then one, would be another copy.
+    matrix, together = rows.matrix.new_empty(rows.matrix.shape), by.room()
+    for at, (own, derivatives) in zip(pieces, found, strict=False):
+        matrix[at] = own
+        together.put(at, derivatives)
+    return replace(rows, matrix=matrix), together
 
 
 def _pieces(label: Int[Tensor, " m"]) -> list[slice]:

@@ -45,7 +45,11 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     if not isinstance(normal, MapEquations):
         normal = backend.assemble(problem, state.values)
         state = replace(state, normal=normal, linearizations=state.linearizations + 1)
+        # What was added up leaves room between what is kept, where it went to.
+        give_back()
     state = lm.step(problem, state, bundle.config.lm, backend=backend)
+    # As large as what the lenses are taken anew in.
+    del problem
     if not bool(state.accepted.all()):
         return state, state.done
     evidence = bundle.evidence() or bundle.told_by(normal)

@@ -280,7 +280,8 @@ def _adjusted(
         watch.step(len(watch.iterations), state, bundle, seen())
         kept.keep_step(adjust.standing(bundle, state, iteration + 1), watch.course, anew)
         progress("bundle adjustment", iteration + 1, most, f"cost {float(state.cost):.1f}")
-    return state, by
+    # Its equations have served: covariances begin where the adjustment ended.
+    return replace(state, normal=None), by
 
 
 @contextmanager

@@ -7,9 +7,11 @@ and its pages go first where there is not.
 
 from __future__ import annotations
 
+import mmap
 import tempfile
 from contextlib import suppress
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -21,6 +23,9 @@ _LEAST = 1 << 16
 """Smaller tensors [bytes] stay where they are."""
 _ALIGNED = 64
 """Tensors begin at multiples of so many bytes, as those that torch takes memory for."""
+_PAGE_OUT = 21
+"""`MADV_PAGEOUT` of Linux."""
+_resting: WeakSet[mmap.mmap] = WeakSet()
 
 
 def rest(record: Any) -> Any:
@@ -39,7 +44,10 @@ def rest(record: Any) -> Any:
             places[id(tensor)] = file.tell()
             file.write(tensor.contiguous().numpy().data)
         file.flush()
-        mapped = np.memmap(file, dtype=np.uint8, mode="c")
+        length = file.tell()
+        area = mmap.mmap(file.fileno(), length, access=mmap.ACCESS_COPY)
+        _resting.add(area)
+        mapped = np.frombuffer(area, dtype=np.uint8)
 
         def moved(tensor: Tensor) -> Tensor:
             first = places.get(id(tensor))
@@ -51,6 +59,16 @@ def rest(record: Any) -> Any:
 
         return with_tensors(record, moved)
     return record
+
+
+def leave() -> None:
+    """Tells the system that nobody reads what rests for a while: it takes no memory of this process until somebody does.
+
+    What was written since it rests stays (Linux; elsewhere nothing happens).
+    """
+    for area in list(_resting):
+        with suppress(OSError, ValueError):
+            area.madvise(_PAGE_OUT)
 
 
 def _large(record: Any) -> list[Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from crowdmap_torch.processes import at_rest
-from crowdmap_torch.processes.at_rest import rest
+from crowdmap_torch.processes.at_rest import leave, rest
 from crowdmap_torch.processes.records import alone
 
 
@@ -91,6 +92,21 @@ def test_memory_is_a_files() -> None:
     assert anonymous(resting.column) == 0
     resting.column[:1000] = 2.0
     assert 0 < anonymous(resting.column) < 64
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux can be told to")
+def test_what_is_left_takes_no_memory_until_it_is_read() -> None:
+    def resident_mb() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+    resting = rest(Held("x", torch.ones(8_000_000, dtype=torch.float64), (), {}))
+    resting.column[:1000] = 7.0
+    assert float(resting.column.sum()) == 8e6 + 6e3
+    before = resident_mb()
+    leave()
+    assert before - resident_mb() > 50
+    assert float(resting.column.sum()) == 8e6 + 6e3
+    assert before - resident_mb() < 10
 
 
 def test_where_there_is_no_disk_it_stays_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -169,9 +169,10 @@ class BlockDiagonal:
         return self._gradient[name].mT.contiguous()
 
     def hessian(self, name: str) -> Float[Tensor, "n k k"]:
-        """The diagonal blocks of a variable."""
-        upper = self._square[name].permute(2, 0, 1).contiguous()
-        return upper + upper.triu(1).mT
+        """The diagonal blocks of a variable, which are handed over: they are here no more."""
+        # The blocks are symmetric; the sums, their upper triangles, go before the lower ones come.
+        upper = self._square.pop(name).permute(2, 0, 1).contiguous()
+        return upper.add_(upper.triu(1).mT)
 
 
 def add_blocks(

@@ -304,7 +304,7 @@ class ChainNormalEquations:
 
             done = in_order(eliminated, of_round.batches, store.device)
             for batch, found in zip(of_round.batches, done, strict=True):
-                add_at(store, 0, batch.fill.flatten(), found.fill)
+                add_at(store, 0, batch.fill.flatten().long(), found.fill)
                 if found.scattered is not None:
                     add_at(system.flat, 0, *found.scattered)
                 elif batch.products is not None:
@@ -384,7 +384,7 @@ def border_information(
 
 
 def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> ChainNormalEquations:
-    none = [sums.link[:, :, :0]]
+    border = [*sums.border.values()] or [sums.link[:, :, :0]]
     return ChainNormalEquations(
         cost=costs.total,
         term_cost=costs.by_term,
@@ -393,7 +393,7 @@ def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> Chain
         link=sums.link,
         eliminated_gradient=sums.gradient(),
         coupling=sums.coupling,
-        border_link=torch.cat(none + list(sums.border.values()), dim=-1),
+        border_link=border[0] if len(border) == 1 else torch.cat(border, dim=-1),
         hessian=sums.hessian_of_stays(),
         gradient=sums.gradient_of_stays(),
         workspace=workspace,

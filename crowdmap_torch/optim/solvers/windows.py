@@ -301,7 +301,9 @@ class WindowBuilder:
         row = self.first_row[receiver][:, :, None, :] + torch.where(is_gradient, 0, place + rest)
         has = (receiver < self.n)[:, :, None, :]
         good = has & (is_gradient | (found & known[:, None, :, None]))
-        return torch.where(good, row, self.store_rows)
+        row = torch.where(good, row, self.store_rows)
+        # A tenth of what an adjustment holds, on a CPU. On a GPU their order is kept with them, and they are not converted.
+        return row.to(torch.int32) if row.device.type == "cpu" else row
 
     def rows(self, block: Tensor, landmark: Tensor, widths: Sequence[int]) -> Tensor:
         """Store rows of factors' columns, one behind the other; the landmarks have these widths."""
