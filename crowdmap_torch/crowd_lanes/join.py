@@ -18,6 +18,7 @@ from crowdmap_torch.clustering.groups import group_mode, group_sum
 from crowdmap_torch.crowd_lanes.density_ridge import RidgeConfig
 from crowdmap_torch.crowd_lanes.duplicates import covered_twice, crosses_longer
 from crowdmap_torch.crowd_lanes.extend_ends import extended, supported_rows
+from crowdmap_torch.crowd_lanes.how_often import how_often
 from crowdmap_torch.crowd_lanes.lateral_offsets import LateralOffsetConfig, journey_offsets
 from crowdmap_torch.crowd_lanes.line_samples import LineSamples, owners_around
 from crowdmap_torch.crowd_lanes.polyline_linking import Polylines, keep_rows
@@ -29,6 +30,7 @@ from crowdmap_torch.crowd_lanes.samples import (
 )
 from crowdmap_torch.crowd_lanes.splines import (
     Curves,
+    Match,
     curves_of,
     curves_through,
     fit_curves,
@@ -77,6 +79,8 @@ class LaneJoinConfig(Settings):
     """Of two curves nearer to each other the lesser is dropped, unless ..."""
     seen_together: Share = 0.3
     """... this share of its journeys saw both at once."""
+    least_often: Share = 0.2
+    """Markers are detected at least this often, as a share of what is usual where the same drives see markers."""
     trace: TraceConfig = field(default_factory=TraceConfig)
     """What makes a marker."""
     lateral_offset: LateralOffsetConfig = field(default_factory=LateralOffsetConfig)
@@ -104,6 +108,8 @@ class LaneJoinReport:
     bridged_gaps: int
     duplicates_m: float
     """Length of curves dropped because another one covers them [m]."""
+    seldom_m: float
+    """Length of curves dropped because they are detected too seldom [m]."""
     rms_before_m: float
     """Lateral scatter of the samples about the lanes as they came."""
     rms_after_m: float
@@ -151,7 +157,8 @@ def join_lanes(lanes: Lanes, positioning: PositioningNoise, config: LaneJoinConf
     curves = _supported(curves, moved, gate, config)
     curves = _along_travel(curves, moved, gate)
     offset = offset[merged_as]
-    matched = match(kept.moved(-offset).line, curves, gate=gate)
+    line = kept.moved(-offset).line
+    curves, matched, seldom = _often_enough(curves, line, kept, lanes, gate, config)
     table = lanes_table(curves, lanes, kept, matched, offset_sigma=positioning.drift_sigma_m)
     used = matched.curve >= 0
     return JoinedLanes(
@@ -166,6 +173,7 @@ def join_lanes(lanes: Lanes, positioning: PositioningNoise, config: LaneJoinConf
             unused_samples=int((~used).sum()),
             bridged_gaps=traced.polylines.count - lines.count,
             duplicates_m=duplicates,
+            seldom_m=seldom,
             rms_before_m=_rms(matched.shifted(offset).lateral[used]),
             rms_after_m=_rms(matched.lateral[used]),
         ),
@@ -324,6 +332,34 @@ def _supported(curves: Curves, samples: LineSamples, gate: float, config: LaneJo
     return select_curves(curves, enough & (curves.length >= rules.min_length_m))
 
 
+def _often_enough(
+    curves: Curves,
+    line: LineSamples,
+    samples: LaneSamples,
+    lanes: Lanes,
+    gate: float,
+    config: LaneJoinConfig,
+) -> tuple[Curves, Match, float]:
+    """The curves that are detected often enough, the samples on them, and the length of the others [m].
+
+    What was taken for one of these may lie on another.
+    """
+    matched = match(line, curves, gate=gate)
+    of_piece = lanes.n_observations / torch.bincount(samples.piece, minlength=len(lanes))
+    on = matched.curve >= 0
+    share = how_often(
+        *(matched.curve[on], matched.station[on], line.owner[on]),
+        of_piece[samples.piece[on]].to(line.weight),
+        len(curves),
+    )
+    often = share >= config.least_often
+    if bool(often.all()):
+        return curves, matched, 0.0
+    dropped = float(curves.length[~often].sum())
+    curves = select_curves(curves, often)
+    return curves, match(line, curves, gate=gate), dropped
+
+
 def _along_travel(curves: Curves, samples: LineSamples, gate: float) -> Curves:
     """The curves, turned round where most samples run against them."""
     matched = match(samples, curves, gate=gate)
@@ -344,7 +380,7 @@ def _nothing(lanes: Lanes, samples: LaneSamples) -> JoinedLanes:
         lanes=lanes.select(row),
         piece_lane=torch.full_like(lanes.journey, -1),
         support=LaneSupport(samples.line.point[:0], row, row, row),
-        report=LaneJoinReport(0, 0, 0, 0, 0.0, 0.0, 0.0),
+        report=LaneJoinReport(0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0),
     )
 
 

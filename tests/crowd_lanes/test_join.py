@@ -134,6 +134,18 @@ def test_wrong_pieces_across_two_markers_make_no_lane() -> None:
     assert figures.recall >= 0.99
 
 
+@pytest.mark.parametrize(("detections", "lanes"), [(6, 2), (16, 3)])
+def test_what_is_detected_now_and_then_beside_markers_is_none(detections: int, lanes: int) -> None:
+    every = lanes_of([(line(0), "solid"), (line(3.5), "solid"), (line(1.6), "dashed")], 6)
+    often = torch.where(every.tracklet == 2, detections, 40)
+    joined = join_lanes(replace(every, n_observations=often), NOISE, CONFIG)
+    assert len(joined.lanes) == lanes
+    dropped = 200.0 if lanes == 2 else 0.0
+    assert joined.report.seldom_m == pytest.approx(dropped, abs=5.0)
+    # Its pieces are of no lane.
+    assert bool((joined.piece_lane[every.tracklet == 2] < 0).all()) == (lanes == 2)
+
+
 def test_control_points_are_about_equally_spaced(joined: JoinedLanes) -> None:
     lanes = joined.lanes
     chord = (lanes.control.point_world[1:] - lanes.control.point_world[:-1]).norm(dim=1)
