@@ -27,6 +27,7 @@ from crowdmap_torch.crowd_signs.projections import (
     candidates_of,
     misfit_px,
     projection_errors,
+    usual_misfit_px,
 )
 from crowdmap_torch.crowd_signs.register import Crowd, CrowdConfig
 from crowdmap_torch.geometry import polygon
@@ -43,6 +44,9 @@ from crowdmap_torch.ranges import (
 )
 from crowdmap_torch.tables import Association, Journey, Signs, Tracklets
 
+_USUAL = 2.0
+"""Hardly any detection is farther off its sign than so many times what half of them are."""
+
 
 @dataclass(frozen=True)
 class CompleteTracksConfig(Settings):
@@ -55,7 +59,7 @@ class CompleteTracksConfig(Settings):
     error_window_s: Seconds = 1.0
     """For so long before and after, a detection of a sign tells how its projection errs [s]."""
     known_px: Pixels = 3.0
-    """Where that is known, most corners are within so many pixels ..."""
+    """Where that is known, most corners are within so many pixels, or within twice what is usual of the drive, ..."""
     known_share: Share = 0.1
     """... and this share of the outline's larger side of the projection."""
     vote_share: Share = 0.35
@@ -64,7 +68,7 @@ class CompleteTracksConfig(Settings):
     """... other signs so many times as far, ..."""
     vote_majority: Share = 0.6
     """... and so is this share of the detections of the tracklet, ..."""
-    vote_detections: Count = 3
+    vote_detections: Count = 1
     """... which has at least so many."""
     displaced_px: Pixels = 45.0
     """An outline this far off may be the only one missing in its frame of a sign that is seen before and after, ..."""
@@ -352,6 +356,7 @@ def _with_fitting(
         journey, pose, signs, association, reach_m=config.reach_m, count=config.candidates
     )
     for _ in range(config.passes):
+        usual = usual_misfit_px(journey, pose, signs, association, window_s=config.error_window_s)
         error = projection_errors(
             journey, pose, signs, association, pairs, window_s=config.error_window_s
         )
@@ -359,7 +364,11 @@ def _with_fitting(
         limit = config.known_px + config.known_share * pairs.size
         known = misfit.masked_fill(~error.is_known | (misfit > limit), torch.inf)
         _, target = cheapest(pairs.row, pairs.sign, known, len(association.sign))
-        voted = _tracklet_votes(tracklets, pairs, misfit, error, len(target), config)
+        # Where images are noisy most are farther off than that.
+        known_px = max(config.known_px, _USUAL * usual)
+        voted = _tracklet_votes(
+            tracklets, pairs, misfit, error, len(target), replace(config, known_px=known_px)
+        )
         target = torch.where(target < 0, voted, target)
         association = _with_signs(association, target, pairs, shift)
     return association

@@ -96,6 +96,29 @@ def test_a_sign_that_found_no_cluster_comes_back(drive: SignDrive, lost: int):
     assert not ((found.sign >= 0) & (found.sign != drive.sign)).any()
 
 
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_glimpses_of_a_sign_come_back(drive: SignDrive, lost: int):
+    known = drive.sign != lost
+    # Every one of them alone in its tracklet: how the projections err there is told by nothing.
+    label = torch.where(known, drive.sign, 3 + (~known).cumsum(0))
+    found = completed(drive, known, label, pose_error=(0.1, 0.0, 0.05))
+    share = (found.sign == drive.sign)[~known].double().mean()
+    assert share > 0.9
+    assert not ((found.sign >= 0) & (found.sign != drive.sign)).any()
+
+
+@pytest.mark.parametrize("noise_px", [0.4, 2.0, 4.0])
+def test_detections_come_back_in_noisy_images_too(noise_px: float, generator: torch.Generator):
+    drive = drive_past(straight_poses(80), signs_at(PLACES), noise_px=noise_px)
+    known = torch.rand(len(drive.sign), generator=generator) < 0.7
+    label = torch.where(known, drive.sign, 3 + (~known).cumsum(0))
+    found = completed(drive, known, label)
+    # As far as they can be told from those of the other sign on the post.
+    share = (found.sign == drive.sign)[~known].double().mean()
+    assert share > (0.99 if noise_px < 1 else 0.9)
+    assert ((found.sign >= 0) & (found.sign != drive.sign)).double().mean() < 0.01
+
+
 def test_a_sign_that_is_not_in_the_map_is_not_its_neighbour(drive: SignDrive):
     known = drive.sign != 1
     signs = map_of(drive)[torch.tensor([0, 2])]
