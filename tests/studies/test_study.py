@@ -55,7 +55,7 @@ class Sections(HTMLParser):
 
 
 @contextmanager
-def few_steps(most: int = 2) -> Iterator[None]:
+def few_steps(most: int = 1) -> Iterator[None]:
     """Bundles take that many steps at most: it is not their maps that are judged."""
     steps = adjust.steps
     with pytest.MonkeyPatch.context() as patch:
