@@ -14,7 +14,6 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_sum
 
 _STRETCH_M = 4.0
-"""Pieces overlap: what is seen are stretches of this length, not samples."""
 _USUAL = 0.75
 """Of what a drive sees, by length, this share is detected less often than usual markers: much of it may be none."""
 
@@ -35,17 +34,26 @@ def how_often(
         return station.new_ones(curves)
     journeys = int(journey.max()) + 1
     seen, pair = torch.unique(curve * journeys + journey, return_inverse=True)
-    stretch = (station / _STRETCH_M).floor().long().clamp_min(0)
-    stretches = int(stretch.max()) + 1
-    metres = _STRETCH_M * torch.bincount(
-        torch.unique(pair * stretches + stretch) // stretches, minlength=len(seen)
-    ).to(station)
+    metres = metres_seen(pair, station, len(seen))
     number = group_sum(detections, pair, len(seen))
     of_curve, of_journey = seen // journeys, seen % journeys
     usual = _weighted_quantile(number / metres, metres, of_journey, journeys)
     expected = group_sum(usual[of_journey] * metres, of_curve, curves)
     found = group_sum(number, of_curve, curves)
     return torch.where(expected > 0, found / expected, 1.0)
+
+
+def metres_seen(
+    group: Int[Tensor, " s"], station: Float[Tensor, " s"], groups: int
+) -> Float[Tensor, " g"]:
+    """Length of the stretches of a curve, of four metres, on which each group of its samples has any [m].
+
+    Stretches, not samples: pieces overlap.
+    """
+    stretch = (station / _STRETCH_M).floor().long().clamp_min(0)
+    stretches = int(stretch.max()) + 1 if len(stretch) else 1
+    seen = torch.unique(group * stretches + stretch) // stretches
+    return (_STRETCH_M * torch.bincount(seen, minlength=groups)).to(station)
 
 
 def _weighted_quantile(

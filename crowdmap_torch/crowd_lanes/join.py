@@ -18,7 +18,7 @@ from crowdmap_torch.clustering.groups import group_mode, group_sum
 from crowdmap_torch.crowd_lanes.density_ridge import RidgeConfig
 from crowdmap_torch.crowd_lanes.duplicates import covered_twice, crosses_longer
 from crowdmap_torch.crowd_lanes.extend_ends import extended, supported_rows
-from crowdmap_torch.crowd_lanes.how_often import how_often
+from crowdmap_torch.crowd_lanes.how_often import how_often, metres_seen
 from crowdmap_torch.crowd_lanes.lateral_offsets import LateralOffsetConfig, journey_offsets
 from crowdmap_torch.crowd_lanes.line_samples import LineSamples, owners_around
 from crowdmap_torch.crowd_lanes.polyline_linking import Polylines, keep_rows
@@ -310,11 +310,7 @@ def _supported(curves: Curves, samples: LineSamples, gate: float, config: LaneJo
     key, group = torch.unique(
         matched.curve[used] * owners + samples.owner[used], return_inverse=True
     )
-    # Stretches of four metres seen, not samples: pieces overlap.
-    stretch = (matched.station[used] / 4.0).floor().long().clamp_min(0)
-    stretches = int(stretch.max()) + 1 if len(stretch) else 1
-    seen = torch.unique(group * stretches + stretch) // stretches
-    covered = 4.0 * torch.bincount(seen, minlength=len(key))
+    covered = metres_seen(group, matched.station[used], len(key))
     curve = key // owners
     enough = covered >= (0.2 * curves.length[curve]).clamp_max(20.0)
     journeys = torch.bincount(curve[enough], minlength=len(curves))

@@ -27,7 +27,6 @@ from crowdmap_torch.crowd_signs.projections import (
     candidates_of,
     misfit_px,
     projection_errors,
-    usual_misfit_px,
 )
 from crowdmap_torch.crowd_signs.register import Crowd, CrowdConfig
 from crowdmap_torch.geometry import polygon
@@ -356,7 +355,6 @@ def _with_fitting(
         journey, pose, signs, association, reach_m=config.reach_m, count=config.candidates
     )
     for _ in range(config.passes):
-        usual = usual_misfit_px(journey, pose, signs, association, window_s=config.error_window_s)
         error = projection_errors(
             journey, pose, signs, association, pairs, window_s=config.error_window_s
         )
@@ -364,11 +362,7 @@ def _with_fitting(
         limit = config.known_px + config.known_share * pairs.size
         known = misfit.masked_fill(~error.is_known | (misfit > limit), torch.inf)
         _, target = cheapest(pairs.row, pairs.sign, known, len(association.sign))
-        # Where images are noisy most are farther off than that.
-        known_px = max(config.known_px, _USUAL * usual)
-        voted = _tracklet_votes(
-            tracklets, pairs, misfit, error, len(target), replace(config, known_px=known_px)
-        )
+        voted = _tracklet_votes(tracklets, pairs, misfit, error, len(target), config)
         target = torch.where(target < 0, voted, target)
         association = _with_signs(association, target, pairs, shift)
     return association
@@ -383,8 +377,10 @@ def _tracklet_votes(
     config: CompleteTracksConfig,
 ) -> Int[Tensor, " d"]:
     """The sign that most detections of a tracklet lie on, for those that do; -1 for the others."""
+    # Where images are noisy most are farther off than `known_px`.
+    known_px = (_USUAL * error.usual_px).clamp_min(config.known_px)
     limit = config.vote_share * pairs.size
-    limit = torch.where(error.is_known, config.known_px + config.known_share * pairs.size, limit)
+    limit = torch.where(error.is_known, known_px + config.known_share * pairs.size, limit)
     best, sign = cheapest(pairs.row, pairs.sign, misfit, rows)
     other = pairs.sign != sign[pairs.row]
     second, _ = cheapest(pairs.row[other], pairs.sign[other], misfit[other], rows)

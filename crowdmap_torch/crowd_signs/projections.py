@@ -38,6 +38,9 @@ class ProjectionErrors:
     """The sign is seen before and after."""
     is_shown: Bool[Tensor, " p"]
     """Another detection of the frame shows the sign."""
+    usual_px: Float[Tensor, ""]
+    """How far most corners are off where the detection before tells how the projection errs, of half of the detections that
+    show a sign; zero where none follows another."""
 
 
 def candidates_of(
@@ -86,17 +89,29 @@ def projection_errors(
 
     Detections that are further than `window_s` [s] from that of the pair tell nothing.
     """
-    of_rows, sign, off = _corners_off(journey, pose, signs, association)
+    detections = journey.signs
+    rows = torch.nonzero(association.sign >= 0)[:, 0]
+    rows = rows[detections.shape[rows] == signs.shape[association.sign[rows]]]
+    sign = association.sign[rows]
+    px, _ = _projected(journey, pose[detections.frame[rows]], signs, sign)
+    count = polygon.corner_count(signs.shape[sign])
+    corners = polygon.roll(detections.corners_px[rows], association.sign_shift[rows], count)
+
+    t = journey.t_ns - journey.t_ns[:1]
+    window = round(1e9 * window_s)
+    span = int(t[-1:].sum()) + 2 * window + 1  # signs are further apart than any window
+    key = sign * span + t[detections.frame[rows]]
+    asked = pairs.sign * span + t[detections.frame[pairs.row]]
+    order = key.argsort(stable=True)
+    key, off = key[order], (corners - px)[order]
     # Padded slots repeat the last corner, which hardly moves the median.
     error = median_along(off, 1)
-    t, window, span = _clock(journey, window_s)
-    key = sign * span + t[of_rows]
-    asked = pairs.sign * span + t[journey.signs.frame[pairs.row]]
-    order = key.argsort(stable=True)
+    follows = key[1:] - key[:-1] <= window
+    way = median_along((off[1:] - error[:-1, None])[follows].norm(dim=2), 1)
     # An error before and one behind all others, too far from anything to tell.
     beyond = key.new_tensor([-1 - window, len(signs) * span + window])
-    key = torch.cat((beyond[:1], key[order], beyond[1:]))
-    error = torch.nn.functional.pad(error[order], (0, 0, 1, 1))
+    key = torch.cat((beyond[:1], key, beyond[1:]))
+    error = torch.nn.functional.pad(error, (0, 0, 1, 1))
     after = torch.searchsorted(key, asked)
     before = torch.searchsorted(key, asked, right=True) - 1
     way_after, way_before = key[after] - asked, asked - key[before]
@@ -110,50 +125,8 @@ def projection_errors(
         is_known=is_known,
         is_between=has_after & has_before,
         is_shown=way_after == 0,
+        usual_px=median_along(way, 0) if len(way) else way.sum(),
     )
-
-
-def usual_misfit_px(
-    journey: Journey,
-    pose: Float[Tensor, "f 4 4"],
-    signs: Signs,
-    association: Association,
-    *,
-    window_s: float,
-) -> float:
-    """How far most corners of detections lie off the projection of their sign where the one before tells how it errs [px].
-
-    Of half of the detections; zero without any that follows another within `window_s` [s].
-    """
-    of_rows, sign, off = _corners_off(journey, pose, signs, association)
-    t, window, span = _clock(journey, window_s)
-    order = (sign * span + t[of_rows]).argsort(stable=True)
-    sign, t, off = sign[order], t[of_rows][order], off[order]
-    error = median_along(off, 1)
-    follows = (sign[1:] == sign[:-1]) & (t[1:] - t[:-1] <= window)
-    way = (off[1:] - error[:-1, None])[follows].norm(dim=2)
-    return float(median_along(way, 1).median()) if len(way) else 0.0
-
-
-def _corners_off(
-    journey: Journey, pose: Float[Tensor, "f 4 4"], signs: Signs, association: Association
-) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "n 8 2"]]:
-    """Frame and sign of the detections that show one of their shape, and how far their corners are off its projection."""
-    detections = journey.signs
-    rows = torch.nonzero(association.sign >= 0)[:, 0]
-    rows = rows[detections.shape[rows] == signs.shape[association.sign[rows]]]
-    sign, frame = association.sign[rows], detections.frame[rows]
-    px, _ = _projected(journey, pose[frame], signs, sign)
-    count = polygon.corner_count(signs.shape[sign])
-    corners = polygon.roll(detections.corners_px[rows], association.sign_shift[rows], count)
-    return frame, sign, corners - px
-
-
-def _clock(journey: Journey, window_s: float) -> tuple[Int[Tensor, " f"], int, int]:
-    """Time of each frame since the first, a window, and what signs are apart by so that none is in another's [ns]."""
-    t = journey.t_ns - journey.t_ns[:1]
-    window = round(1e9 * window_s)
-    return t, window, int(t[-1:].sum()) + 2 * window + 1
 
 
 def misfit_px(

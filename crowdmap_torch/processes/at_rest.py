@@ -26,6 +26,7 @@ _ALIGNED = 64
 _PAGE_OUT = 21
 """`MADV_PAGEOUT` of Linux."""
 _resting: WeakSet[mmap.mmap] = WeakSet()
+"""The files that anything rests in."""
 
 
 def rest(record: Any) -> Any:

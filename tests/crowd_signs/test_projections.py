@@ -107,6 +107,27 @@ def test_nothing_tells_beyond_the_window(drive: SignDrive):
     assert torch.equal(error.is_shown, first & (frame[pairs.row] == 0))
 
 
+@pytest.mark.parametrize("noise_px", [0.5, 2.0])
+def test_what_is_usual_is_as_large_as_the_noise(noise_px: float):
+    noisy = drive_past(straight_poses(200), signs_at(PLACES), noise_px=noise_px)
+
+    def usual(known: Tensor, pose: Tensor) -> float:
+        association, pairs = associated(noisy, known), own(noisy)
+        found = projection_errors(
+            noisy.journey, pose, map_of(noisy), association, pairs, window_s=1.0
+        )
+        return float(found.usual_px)
+
+    every = torch.ones(len(noisy.sign), dtype=torch.bool)
+    exact = noisy.journey.T_world_camera
+    # The noise of a corner and of the offset before, in the plane: half of them are within 1.18 sigmas.
+    assert usual(every, exact) == pytest.approx(1.18 * 2**0.5 * noise_px, rel=0.3)
+    # Poses that are off by the same all the way do not count.
+    assert usual(every, shifted(noisy)) == pytest.approx(usual(every, exact), rel=0.2)
+    # Nothing follows a single detection.
+    assert usual(torch.arange(len(noisy.sign)) == 0, exact) == 0.0
+
+
 def test_outlines_of_other_shapes_are_compared_by_their_boxes(drive: SignDrive):
     other = taken_for(drive, 0, polygon.OCTAGON)
     misfit, shift = misfit_px(
