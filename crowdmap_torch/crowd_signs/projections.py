@@ -103,11 +103,10 @@ def projection_errors(
     key = sign * span + t[detections.frame[rows]]
     asked = pairs.sign * span + t[detections.frame[pairs.row]]
     order = key.argsort(stable=True)
-    key, off = key[order], (corners - px)[order]
-    # Padded slots repeat the last corner, which hardly moves the median.
-    error = median_along(off, 1)
+    key, off, count = key[order], (corners - px)[order], count[order]
+    error = _median_of_corners(off, count)
     follows = key[1:] - key[:-1] <= window
-    way = median_along((off[1:] - error[:-1, None])[follows].norm(dim=2), 1)
+    way = _reach_of_most((off[1:] - error[:-1, None])[follows].norm(dim=2), count[1:][follows])
     # An error before and one behind all others, too far from anything to tell.
     beyond = key.new_tensor([-1 - window, len(signs) * span + window])
     key = torch.cat((beyond[:1], key, beyond[1:]))
@@ -143,9 +142,7 @@ def misfit_px(
     misfits = []
     for shift in rank:
         way = (polygon.roll(seen, shift.expand_as(count), count) - expected).norm(dim=2)
-        way = way.masked_fill(rank >= count[:, None], torch.inf).sort(1).values
-        most = way.gather(1, count[:, None] // 2)[:, 0]
-        misfits.append(most.masked_fill(shift >= count, torch.inf))
+        misfits.append(_reach_of_most(way, count).masked_fill(shift >= count, torch.inf))
     misfit, shift = torch.stack(misfits, dim=1).min(1)
     (centre, extent), (other_centre, other_extent) = box(seen), box(expected)
     by_box = torch.maximum(
@@ -159,6 +156,28 @@ def box(px: Float[Tensor, "p 8 2"]) -> tuple[Float[Tensor, "p 2"], Float[Tensor,
     """Centre and extent of the box around each outline [px]; padded slots repeat a corner."""
     low, high = px.amin(1), px.amax(1)
     return (low + high) / 2, high - low
+
+
+def _median_of_corners(
+    off: Float[Tensor, "n 8 2"], count: Int[Tensor, " n"]
+) -> Float[Tensor, "n 2"]:
+    """By axis the median of so many corners; padded slots count nothing."""
+    ranked = _ranked_corners(off.mT, count[:, None])
+    middle = torch.stack(((count - 1) // 2, count // 2), dim=1)
+    return ranked.gather(2, middle[:, None].expand(-1, 2, -1)).mean(2)
+
+
+def _reach_of_most(way: Float[Tensor, "n 8"], count: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """The distance within which most of so many corners lie."""
+    return _ranked_corners(way, count).gather(1, count[:, None] // 2)[:, 0]
+
+
+def _ranked_corners(
+    value: Float[Tensor, "*n 8"], count: Int[Tensor, "*#n"]
+) -> Float[Tensor, "*n 8"]:
+    """Values of corners in order; behind so many there is infinity."""
+    is_padded = torch.arange(polygon.MAX_CORNERS, device=count.device) >= count[..., None]
+    return value.masked_fill(is_padded, torch.inf).sort(-1).values
 
 
 def _projected(
