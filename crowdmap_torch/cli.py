@@ -17,6 +17,7 @@ from crowdmap_torch import __version__
 from crowdmap_torch.commands.subcommands import OneLineParser, add_subcommands
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.processes.interrupts import Interruptible, kept
+from crowdmap_torch.processes.memory import arrow_in_one_place
 from crowdmap_torch.processes.streams import StandardStreams
 
 COMMANDS = {
@@ -39,6 +40,7 @@ _OUTPUT_UNREAD = 128 + 13
 
 def program(*first: str) -> NoReturn:
     """Is the whole process: what follows `first` on its command line is read, and it ends with the exit code."""
+    arrow_in_one_place()
     sys.exit(main([*first, *sys.argv[1:]], last=True))
 
 

@@ -18,7 +18,7 @@ from crowdmap_torch.adjustment.cuts import convoys
 from crowdmap_torch.adjustment.lane_matching import LaneMatches
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.adjustment.parts import VARIABLES, Observations, Priors, SharedOut, Unknowns
-from crowdmap_torch.adjustment.relinearisation import Relinearised, relinearised_at
+from crowdmap_torch.adjustment.relinearisation import Linearised, relinearise
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections, KeptDetections
 from crowdmap_torch.optim.problem import Variable, euclidean, pull_euclidean
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
@@ -112,7 +112,10 @@ class BundleState(nn.Module):
         self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
         self.register_buffer("told_at", torch.full_like(self.scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
-        self.corners, self.lane_points = corners, observations.lane_points
+        # Their matrices are the bundle's own: lenses are taken anew in place.
+        points = observations.lane_points
+        self.corners = replace(corners, matrix=corners.matrix.clone())
+        self.lane_points = replace(points, matrix=points.matrix.clone())
         self.lenses = observations.lenses
         self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
         # Where each lane point was followed to is part of the state: matching starts from there.
@@ -190,15 +193,13 @@ class BundleState(nn.Module):
         values = self.values()
         self._by_mount = self.fleet.by_mount(values["pose"])
         by_corner, by_point = self._by_optics
-        found = relinearised_at(
+        relinearise(
+            Linearised(self.corners, by_corner, self.lane_points, by_point),
             values,
-            Relinearised(self.corners, by_corner, self.lane_points, by_point),
             *(self.matches, self.lane_count, self.lenses),
             self.fleet,
             self.lane_axes[:, :, 1],
         )
-        self.corners, self.lane_points = found.corners, found.lane_points
-        self._by_optics = (found.by_corner, found.by_lane_point)
 
     def rest(self) -> None:
         """Puts the observations, which others have, into a file, and forgets what follows from them until `relinearise`."""

@@ -169,10 +169,6 @@ class ByOptics:
         by = like.new_zeros(count, 2, k), like.new_zeros(count, heights, k)
         return cls(*by, like.new_zeros(count * heights, 3))
 
-    def room(self) -> ByOptics:
-        """Memory for those of as many rows; what is in it is of no account."""
-        return ByOptics(*(of.new_empty(of.shape) for of in (self.image, self.height, self.left)))
-
     def put(self, at: slice, some: ByOptics) -> None:
         """Takes over those of some rows, in place."""
         self.image[at], self.height[at], self.left[at] = some.image, some.height, some.left

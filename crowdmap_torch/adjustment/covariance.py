@@ -26,6 +26,7 @@ from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.geometry.covariances import at_least
 from crowdmap_torch.optim.problem import Values
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, MapCovariance
+from crowdmap_torch.processes.memory import give_back
 from crowdmap_torch.tables import Lanes, Signs
 
 _MOST_PLACES = 200
@@ -81,8 +82,10 @@ def map_uncertainty(
             convoys = ends.enter_context(Convoys(bundle, None, engine))
             covariance, of_bias = convoys.covariance(expected)
         else:
-            problem = bundle.information(expected)
-            covariance = bundle.backend().assemble(problem, values).covariance()
+            equations = bundle.backend().assemble(bundle.information(expected), values)
+            # What was added up leaves room where the factor goes.
+            give_back()
+            covariance = equations.covariance()
             of_bias = covariance.of_sums(*sums_of_bias(bundle))
     to_bias = bias_of_poses(values["pose"][nodes.first])
     count = torch.bincount(nodes.journey, minlength=journeys)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -20,12 +19,11 @@ from crowdmap_torch.processes.threads import in_order
 
 _AT_ONCE = 1 << 14
 """Rows that are seen to at once."""
-Observed = TypeVar("Observed", CornerObservations, LanePointObservations)
 
 
 @dataclass(frozen=True)
-class Relinearised:
-    """Observations with every lens as it is where their points are, and their derivatives by their cars' optics."""
+class Linearised:
+    """Observations with every lens as it is where their points were last, and their derivatives by their cars' optics."""
 
     corners: CornerObservations
     by_corner: ByOptics
@@ -33,31 +31,31 @@ class Relinearised:
     by_lane_point: ByOptics
 
 
-def relinearised_at(
+def relinearise(
+    observed: Linearised,
     values: Mapping[str, Tensor],
-    before: Relinearised,
     matches: LaneMatches,
     lane_count: Int[Tensor, " n"],
     lenses: Sequence[Camera],
     fleet: Fleet,
     left_lane: Float[Tensor, "c 3"],
-) -> Relinearised:
-    """Those with the unknowns, and the splines' matches, where they are.
+) -> None:
+    """Takes them anew with the unknowns, and the splines' matches, where they are: in place, a second set would be large.
 
-    `left_lane` is across each lane coefficient's marker, along the road. Without a point of a kind its derivatives stay.
+    `left_lane` is across each lane coefficient's marker, along the road.
     """
     T_camera_world = se3.inverse(values["pose"])
     of_coefficients = torch.cat((values["lane"], left_lane), dim=1)
 
     def corners(at: slice) -> tuple[Tensor, ByOptics]:
-        rows = before.corners[at]
+        rows = observed.corners[at]
         corner = torch.nn.functional.pad(rows.template * values["size"][rows.sign], (0, 1))
         point = se3.transform(values["sign"][rows.sign], corner)
         return seen(rows, point, None)
 
     def lane_points(at: slice) -> tuple[Tensor, ByOptics]:
         point, across = matches[at].points(of_coefficients, lane_count).split(3, dim=1)
-        return seen(before.lane_points[at], point, across)
+        return seen(observed.lane_points[at], point, across)
 
     def seen(
         rows: CornerObservations | LanePointObservations,
@@ -69,32 +67,14 @@ def relinearised_at(
         return rows.matrix, fleet.by_optics(rows, lenses, point, values["pose"], across)
 
     # At once they would take as much memory as all normal equations.
-    pieces = [(corners, at) for at in _pieces(before.corners.detection)]
-    first_point = len(pieces)
-    pieces += [(lane_points, at) for at in _pieces(before.lane_points.frame)]
-    device = values["pose"].device
-    found = in_order(lambda piece: piece[0](piece[1]), pieces, device, worth=1)
-    of_corners, of_points = (
-        [at for _, at in some] for some in (pieces[:first_point], pieces[first_point:])
-    )
-    return Relinearised(
-        *_joined(before.corners, before.by_corner, of_corners, found),
-        *_joined(before.lane_points, before.by_lane_point, of_points, found),
-    )
-
-
-def _joined(
-    rows: Observed, by: ByOptics, pieces: Sequence[slice], found: Iterator[tuple[Tensor, ByOptics]]
-) -> tuple[Observed, ByOptics]:
-    """The rows with the matrices and derivatives of all pieces, which are found next; as they are without any."""
-    if not pieces:
-        return rows, by
-    # Each goes to its place when it comes: all of them, and then one, would be another copy.
-    matrix, together = rows.matrix.new_empty(rows.matrix.shape), by.room()
-    for at, (own, derivatives) in zip(pieces, found, strict=False):
+    of_corners = corners, observed.corners.matrix, observed.by_corner
+    of_points = lane_points, observed.lane_points.matrix, observed.by_lane_point
+    pieces = [(at, *of_corners) for at in _pieces(observed.corners.detection)]
+    pieces += [(at, *of_points) for at in _pieces(observed.lane_points.frame)]
+    found = in_order(lambda piece: piece[1](piece[0]), pieces, values["pose"].device, worth=1)
+    for (at, _, matrix, by_optics), (own, derivatives) in zip(pieces, found, strict=True):
         matrix[at] = own
-        together.put(at, derivatives)
-    return replace(rows, matrix=matrix), together
+        by_optics.put(at, derivatives)
 
 
 def _pieces(label: Int[Tensor, " m"]) -> list[slice]:

@@ -19,6 +19,7 @@ from statistics import median
 
 import crowdmap_torch
 from crowdmap_torch.io.errors import InputError, input_read
+from crowdmap_torch.processes.memory import ARROW_POOL
 from crowdmap_torch.ranges import CountOrNone, argument
 
 _EVERY_S = 0.05
@@ -112,14 +113,13 @@ def measured(checkout: Path, dataset: Path, workers: int) -> Measured:
         out, said = Path(scratch) / "run", Path(scratch) / "said"
         command = [sys.executable, "-m", "crowdmap_torch", "optimize", str(dataset.resolve())]
         command += ["--out", str(out), "--workers", str(workers)]
+        # Where Arrow takes its memory is for each checkout to say.
+        environment = {**os.environ, "PYTHONPATH": str(checkout.resolve())}
+        environment.pop(ARROW_POOL, None)
         begun, peak = time.perf_counter(), 0
         with said.open("wb") as file:
             process = subprocess.Popen(
-                command,
-                cwd=scratch,
-                env={**os.environ, "PYTHONPATH": str(checkout.resolve())},
-                stdout=file,
-                stderr=subprocess.STDOUT,
+                command, cwd=scratch, env=environment, stdout=file, stderr=subprocess.STDOUT
             )
             while True:
                 ended, status, used = os.wait4(process.pid, os.WNOHANG)

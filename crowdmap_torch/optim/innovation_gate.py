@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import chdtri
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import chunks, row_blocks
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, at_once, chunks, row_blocks
 from crowdmap_torch.optim.problem import CostTerm, Values, Variable
 from crowdmap_torch.optim.robust import JointTukey, Quadratic
 from crowdmap_torch.processes.sums import add_at
@@ -73,14 +73,21 @@ def innovations(
     first = count.cumsum(0) - count
     weight, block = loss.weight(s)[first], term.slots[0][1][first]
     matrix, gradient = matrix.view(n, k, k), gradient[..., None]
-    counted = weight[:, None, None]
-    # Without its rows the block moves along them, and the residual with it. A block without a covariance has no
-    # innovation either, and nothing is held against it.
-    without = torch.linalg.inv_ex(covariance[block]).inverse - counted * matrix
-    step = torch.linalg.solve_ex(without, counted * gradient).result
-    change = matrix @ step
-    square = square + (step * (2 * gradient + change))[..., 0].sum(-1)
-    gradient = gradient + change
-    # The residual's covariance is one and what the block adds; its inverse by Woodbury's identity.
-    own = (gradient * torch.linalg.solve_ex(without + matrix, gradient).result)[..., 0].sum(-1)
-    return Innovations(square - own, loss.row_dim * count, weight)
+
+    def normalised(at: Int[Tensor, " m"]) -> Float[Tensor, " m"]:
+        counted, of_rows, pull = weight[at, None, None], matrix[at], gradient[at]
+        # Without its rows the block moves along them, and the residual with it. A block without a covariance has no
+        # innovation either, and nothing is held against it.
+        without = torch.linalg.inv_ex(covariance[block[at]]).inverse - counted * of_rows
+        step = torch.linalg.solve_ex(without, counted * pull).result
+        change = of_rows @ step
+        moved = square[at] + (step * (2 * pull + change))[..., 0].sum(-1)
+        pull = pull + change
+        # The residual's covariance is one and what the block adds; its inverse by Woodbury's identity.
+        own = (pull * torch.linalg.solve_ex(without + of_rows, pull).result)[..., 0].sum(-1)
+        return moved - own
+
+    # All at once would take as much memory as the rows themselves.
+    some = torch.arange(n, device=run.device).split(at_once(CHUNK_ROWS, run.device))
+    found = torch.cat([square[:0], *map(normalised, some)])
+    return Innovations(found, loss.row_dim * count, weight)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
+ARROW_POOL = "ARROW_DEFAULT_MEMORY_POOL"
+"""Variable of the environment that says where Arrow takes its memory."""
 _ARENA_MAX = -8
 """`M_ARENA_MAX` of malloc.h."""
 _STATUS, _PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -41,12 +44,21 @@ def keep_in_one_place() -> None:
         library.mallopt(_ARENA_MAX, 1)
 
 
+def arrow_in_one_place() -> None:
+    """From now on Arrow, in this process and in those that it begins, takes memory where all else does.
+
+    To be called before it is loaded. Memory of its own is kept for good where tables were once read: 57 MB of the 25 drives
+    of 1 km that were. What `ARROW_POOL` says already stands.
+    """
+    os.environ.setdefault(ARROW_POOL, "system")
+
+
 def give_back() -> None:
     """Hands what was freed back to the system, where the C library can be told to (glibc); elsewhere nothing happens.
 
     It keeps freed tensors of less than some megabytes between those that are still used: a quarter of what an adjustment
-    of 25 drives held between two steps. So does Arrow, which has memory of its own, of tables that were read. It takes
-    some milliseconds for each gigabyte.
+    of 25 drives held between two steps. So does Arrow, where it has memory of its own. It takes some milliseconds for each
+    gigabyte.
     """
     arrow = sys.modules.get("pyarrow")
     if arrow is not None:

@@ -13,6 +13,7 @@ from crowdmap_torch.adjustment import adjust, relinearisation
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import columns
 from crowdmap_torch.adjustment.lane_matching import follow
+from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.mapper import MapResult, build_bundle
@@ -184,17 +185,49 @@ def test_rows_are_relinearised_piece_by_piece_to_the_same_bits(
 ):
     bundle = build()
     bundle.refresh()
+    terms, before = bundle.problem().terms, bundle.values()
+    names = ("sign_reprojection", "lane_reprojection", "lane_height")
+    expected = {
+        name: [of.clone() for of in (residuals(terms[name], before), *terms[name].constants)]
+        for name in names
+    }
+    # Somewhere else first: it is done in place.
+    moved = dict(before, pose=se3.retract(before["pose"], torch.full((1, 6), 0.01).double()))
+    bundle.fold(moved)
+    bundle.relinearise()
+    assert not torch.equal(bundle.problem().terms[names[0]].constants[-1], expected[names[0]][-1])
+    bundle.fold(before)
     # Within a piece boxes need all corners of a detection: a bound that parts most of them if any is parted.
     monkeypatch.setattr(relinearisation, "_AT_ONCE", 7)
-    whole, before = bundle.problem(), bundle.values()
     bundle.relinearise()
-    parted = bundle.problem()
-    for name in ("sign_reprojection", "lane_reprojection", "lane_height"):
-        assert torch.equal(
-            residuals(parted.terms[name], before), residuals(whole.terms[name], before)
+    terms = bundle.problem().terms
+    for name in names:
+        pairs = zip(
+            (residuals(terms[name], before), *terms[name].constants), expected[name], strict=True
         )
-        pairs = zip(parted.terms[name].constants, whole.terms[name].constants, strict=True)
-        assert all(torch.equal(found, expected) for found, expected in pairs)
+        assert all(torch.equal(found, of) for found, of in pairs)
+
+
+def test_bundles_of_the_same_observations_take_lenses_anew_each_by_itself(
+    build: Callable[[], Bundle],
+):
+    one = build()
+    bent = torch.tensor([-0.1, 0.01, 0.0, 0.0]).double()
+    lenses = tuple(replace(lens, distortion=bent) for lens in one.lenses)
+    observed = Observations(one.corners, one.lane_points, one.matches, lenses)
+    other = Bundle(
+        Unknowns(one.values(), one.frame, one.lane_count),
+        observed,
+        Priors(one.prior, one.fixed, one.beside, one.fleet),
+        one.config,
+    )
+    before = observed.corners.matrix.clone(), observed.lane_points.matrix.clone()
+    pose = se3.retract(other.values()["pose"], torch.full((1, 6), 0.01).double())
+    other.fold(dict(other.values(), pose=pose))
+    other.relinearise()
+    assert not torch.equal(other.corners.matrix, before[0])
+    assert torch.equal(one.corners.matrix, before[0])
+    assert torch.equal(one.lane_points.matrix, before[1])
 
 
 def test_what_only_the_prior_holds_stays_where_that_has_it(tiny_result: MapResult):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from crowdmap_torch.optim import innovation_gate
 from crowdmap_torch.optim.innovation_gate import Innovations, innovations
 from crowdmap_torch.optim.linearize import linearize, residuals
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
@@ -101,6 +102,13 @@ def test_an_innovation_is_what_leaving_the_detection_out_shows(outlier: float):
     expected = torch.stack([by_leaving_out(problem, values, pose) for pose in range(POSES)])
     torch.testing.assert_close(found.squared, expected, rtol=1e-6, atol=1e-8)
     assert found.freedom.tolist() == [CORNERS * ROW_DIM] * POSES
+
+
+def test_innovations_are_found_in_lots_to_the_same_bits(monkeypatch: pytest.MonkeyPatch):
+    problem, values = drive(3.0)
+    whole = judged(problem, values)
+    monkeypatch.setattr(innovation_gate, "CHUNK_ROWS", 2)
+    assert torch.equal(judged(problem, values).squared, whole.squared)
 
 
 def test_an_outlier_that_bends_its_pose_shows_in_the_innovation_alone():

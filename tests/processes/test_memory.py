@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from crowdmap_torch.processes.memory import give_back
+from crowdmap_torch.processes.memory import ARROW_POOL, give_back
 
 
 def resident_mb() -> float:
@@ -29,6 +30,27 @@ def test_what_was_freed_between_what_is_used_goes_back():
     assert before - resident_mb() > 0.25 * 4_000 * 0.064
     assert all(bool((piece == 1).all()) for piece in kept)
     give_back()
+
+
+_POOL = """
+import sys
+from crowdmap_torch.processes.memory import arrow_in_one_place
+arrow_in_one_place()
+import pyarrow
+print(pyarrow.default_memory_pool().backend_name)
+"""
+
+
+def test_arrow_takes_memory_where_all_else_does_unless_told_otherwise():
+    def pool(**said: str) -> str:
+        environment = {k: v for k, v in os.environ.items() if k != ARROW_POOL} | said
+        command = [sys.executable, "-c", _POOL]
+        return subprocess.run(
+            command, env=environment, check=True, capture_output=True, text=True
+        ).stdout.strip()
+
+    assert pool() == "system"
+    assert pool(**{ARROW_POOL: "mimalloc"}) == "mimalloc"
 
 
 _HEAPS = """

@@ -90,6 +90,7 @@ class ChainBackend:
     _structure: ChainStructure | None = field(default=None, repr=False)
     _workspace: Workspace | None = field(default=None, repr=False)
 
+    @torch.no_grad()
     def assemble(self, problem: Problem, values: Values) -> ChainNormalEquations:
         """Normal equations at `values`; memory beyond them is bounded by the chunk.
 
@@ -263,13 +264,14 @@ class ChainNormalEquations:
 
         The arguments are added to the diagonals of A and C.
         """
-        structure, (system, store) = self.structure, self.workspace.room()
+        structure, system, store = self.structure, self.workspace.system(), self.workspace.store()
         self.hessian.add_to(system)
         system.right_side.copy_(self.gradient)
         if added_y is not None:
             system.add_diagonal(added_y + structure.where.gaps)
         products = Products(system)
         leads = tuple(self._eliminate(part, added_x, products, store) for part in structure.parts)
+        del store
         products.subtract()
         self.chains(leads).add(system, self.eliminated_gradient)
         is_undamped = not bool(
@@ -345,7 +347,8 @@ class ChainNormalEquations:
             coupling = structure.couplings.factors[name]
             product = block @ x.index_select(0, coupling.block)[:, : block.shape[2], None]
             add_at(total, 0, coupling.column.flatten(), product.flatten())
-        told = (self.border_link.mT @ x[..., None])[..., 0]
+        # A transposed F would be copied, which is as large as it gets.
+        told = (x[:, None] @ self.border_link)[:, 0]
         by_chain = add_at(told.new_zeros(structure.border.shape), 0, structure.owner, told)
         return add_at(total, 0, structure.border.flatten(), by_chain.flatten())
 
@@ -384,7 +387,6 @@ def border_information(
 
 
 def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> ChainNormalEquations:
-    border = [*sums.border.values()] or [sums.link[:, :, :0]]
     return ChainNormalEquations(
         cost=costs.total,
         term_cost=costs.by_term,
@@ -393,7 +395,7 @@ def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> Chain
         link=sums.link,
         eliminated_gradient=sums.gradient(),
         coupling=sums.coupling,
-        border_link=border[0] if len(border) == 1 else torch.cat(border, dim=-1),
+        border_link=sums.border_link,
         hessian=sums.hessian_of_stays(),
         gradient=sums.gradient_of_stays(),
         workspace=workspace,

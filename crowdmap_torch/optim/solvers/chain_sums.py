@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from itertools import accumulate, pairwise
 
 import torch
 from jaxtyping import Float, Int
@@ -26,11 +27,15 @@ class ChainSums:
         self.by_variable = BlockDiagonal(problem, values)
         self.link = like.new_zeros(len(structure.owner), k, k)
         """Block of A of each chain's block with its successor, of each leaf with the block that carries it."""
+        widths = [problem.variables[name].tangent_dim for name in plan.border]
+        self.border_link = like.new_zeros(len(structure.owner), k, sum(widths))
+        """Block of each with its chain's blocks of the border's variables, one behind the other."""
+        ends = list(accumulate(widths, initial=0))
         self.border = {
-            name: like.new_zeros(len(structure.owner), k, problem.variables[name].tangent_dim)
-            for name in plan.border
+            name: self.border_link[..., begin:end]
+            for name, (begin, end) in zip(plan.border, pairwise(ends), strict=True)
         }
-        """Block of each with its chain's block of every variable of the border."""
+        """The same by variable."""
 
     def add(self, chunk: TermRows) -> None:
         """Adds a chunk of rows."""

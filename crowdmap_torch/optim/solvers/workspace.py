@@ -15,40 +15,44 @@ from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 
 @dataclass
 class Workspace:
-    """What the solves of one back end share; memory is taken once, by parts of a sum each time: others need it meanwhile."""
+    """What the solves of one back end share."""
 
     reduced: TilePattern = field(repr=False)
     """That of the reduced system."""
     rows: int
     """Of the store."""
     is_kept: bool
+    """Whether memory for the reduced system is taken once; of a part of a sum others need it meanwhile."""
     like: Float[Tensor, "0 k"] = field(repr=False)
     """Nothing, as wide as eliminated blocks, with the device and the type of all."""
     couplings: dict[str, Float[Tensor, "f w _"]] = field(default_factory=dict)
     """Of the last normal equations, by term."""
     factor: Factor | None = None
     """Of the last solve."""
-    _kept: tuple[TileMatrix, Tensor] | None = field(default=None, repr=False)
+    _kept: TileMatrix | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, structure: ChainStructure, like: Float[Tensor, "0 k"]) -> Workspace:
         """That of an order of elimination, whatever rows are to be eliminated by it."""
         return cls(structure.reduced, structure.store_rows + 1, structure.plan.is_whole, like)
 
-    def room(self) -> tuple[TileMatrix, Float[Tensor, "rows k"]]:
-        """Zeros for the reduced system, and a store, whatever is in it.
-
-        The store has, per eliminated block and column of its window, a row of `k`, by when it is eliminated; part after part
-        in the same.
-        """
+    def system(self) -> TileMatrix:
+        """Zeros for the reduced system."""
         if self._kept is not None:
-            self._kept[0].flat.zero_()
+            self._kept.flat.zero_()
             return self._kept
-        like = self.like
-        found = TileMatrix.zeros(self.reduced, like), like.new_empty(self.rows, like.shape[1])
+        found = TileMatrix.zeros(self.reduced, self.like)
         if self.is_kept:
             self._kept = found
         return found
+
+    def store(self) -> Float[Tensor, "rows k"]:
+        """Memory to eliminate in, whatever is in it: whoever does lets it go, others need it between two solves.
+
+        Per eliminated block and column of its window it has a row of `k`, by when it is eliminated; part after part in the
+        same.
+        """
+        return self.like.new_empty(self.rows, self.like.shape[1])
 
     def coupling(self, name: str, shape: tuple[int, ...]) -> Float[Tensor, "f w _"]:
         """Memory for a term's coupling; what is in it is of no account."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -20,6 +21,7 @@ from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.optim.solvers.workspace import Workspace
 
 
 def difference(x, y):
@@ -239,6 +241,21 @@ def test_both_back_ends_reach_the_same_minimum():
     assert ours.done
     torch.testing.assert_close(ours.cost, theirs.cost, rtol=1e-9, atol=0)
     torch.testing.assert_close(ours.values["mark"], theirs.values["mark"], rtol=0, atol=1e-6)
+
+
+def test_what_is_eliminated_in_is_let_go(monkeypatch: pytest.MonkeyPatch):
+    taken, take = [], Workspace.store
+
+    def store(workspace: Workspace) -> Tensor:
+        found = take(workspace)
+        taken.append(weakref.ref(found))
+        return found
+
+    monkeypatch.setattr(Workspace, "store", store)
+    built, values, chain = problem([9, 5])
+    equations = ChainBackend(EliminationPlan("pose", chain)).assemble(built, values)
+    equations.solve(torch.zeros(1).double())
+    assert len(taken) == 1 and taken[0]() is None
 
 
 def test_the_step_does_not_depend_on_the_order_of_rows():
