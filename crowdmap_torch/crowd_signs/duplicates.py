@@ -32,7 +32,8 @@ class DuplicateSignConfig(Settings):
     max_distance_m: Length = 1.5
     """... no further apart than this, and no drive saw both in one frame."""
     overlap: Share = 0.35
-    """Closer than this share of the smaller side, they are one plate detected twice, whoever saw both."""
+    """Closer than this share of the smaller side, they are one plate detected twice, whoever saw both; and if one drive did,
+    whatever their codes: no sign was put in the place of another meanwhile."""
     least_sigma_m: Sigma = 0.02
     """1-sigma of places that covariances leave out [m]."""
     candidates: Count = 8
@@ -51,7 +52,7 @@ def may_be_one(
 
     Whether they are, their covariances say, which take long: two plates of one post need none.
     """
-    pair = _alike(signs, config)
+    pair = _alike(signs, associations, config)
     if not len(pair):
         return pair
     label = torch.arange(len(signs), device=pair.device)
@@ -71,7 +72,7 @@ def same_sign(
     Covariances are those of centres without what all positions share.
     """
     label = torch.arange(len(signs), device=signs.shape.device)
-    pair = _alike(signs, config)
+    pair = _alike(signs, associations, config)
     if not len(pair):
         return label
     sigma = signs.size.new_full((3,), config.least_sigma_m)
@@ -92,13 +93,28 @@ def same_sign(
     return group_argmin(-number.to(cost), own)[own]
 
 
-def _alike(signs: Signs, config: DuplicateSignConfig) -> Int[Tensor, "p 2"]:
+def _alike(
+    signs: Signs, associations: Sequence[Association], config: DuplicateSignConfig
+) -> Int[Tensor, "p 2"]:
     """Pairs near each other that look so much alike, of one shape, whose codes do not contradict each other."""
     pair = near_pairs(signs.center_world, radius=config.max_distance_m, count=config.candidates)
     a, b = signs[pair[:, 0]], signs[pair[:, 1]]
-    known = (a.type >= 0) & (b.type >= 0)
+    contradicts = (a.type >= 0) & (b.type >= 0) & (a.type != b.type)
+    # Of one plate half of the detections may have another one's code.
+    is_one_plate = _overlap(signs, pair, config) & _seen_by_one_drive(associations, pair)
     look = appearance_distance(a, b, config.similarity)
-    return pair[(look < config.merge_cost) & (a.shape == b.shape) & ~(known & (a.type != b.type))]
+    is_alike = (look < config.merge_cost) & (a.shape == b.shape)
+    return pair[is_alike & (~contradicts | is_one_plate)]
+
+
+def _seen_by_one_drive(
+    associations: Sequence[Association], pair: Int[Tensor, "p 2"]
+) -> Bool[Tensor, " p"]:
+    """Pairs of signs that some drive detected both, at once or one after the other."""
+    found = torch.zeros_like(pair[:, 0], dtype=torch.bool)
+    for association in associations:
+        found |= torch.isin(pair, association.sign).all(1)
+    return found
 
 
 def _overlap(

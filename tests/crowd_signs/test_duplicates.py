@@ -145,6 +145,16 @@ def test_plates_that_overlap_are_one_whoever_saw_both(drive: SignDrive) -> None:
     assert [2, 3] in seen_together([journey], [both], len(signs)).tolist()
     found = join_duplicates(signs, [journey], [both], CONFIG)
     assert found is not None and len(found[0]) == len(PLACES)
+    # Whatever the codes of a plate that one drive has detected twice, ...
+    other = replace(signs, type=torch.cat((signs.type[:-1], signs.type[-1:] + 1)))
+    assert int(other.type[2]) >= 0
+    found = join_duplicates(other, [journey], [both], CONFIG)
+    assert found is not None and len(found[0]) == len(PLACES)
+    # ... but another one may have been put there between two drives.
+    after = replace(association, sign=association.sign.masked_fill(association.sign == 2, 3))
+    drives = [drive.journey] * 2
+    assert join_duplicates(other, drives, [association, after], CONFIG) is None
+    assert join_duplicates(signs, drives, [association, after], CONFIG) is not None
 
 
 def test_a_sign_of_three_copies_is_one_and_as_sure_as_the_surest(drive: SignDrive) -> None:
