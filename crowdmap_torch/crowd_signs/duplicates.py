@@ -96,7 +96,7 @@ def same_sign(
 def _alike(
     signs: Signs, associations: Sequence[Association], config: DuplicateSignConfig
 ) -> Int[Tensor, "p 2"]:
-    """Pairs near each other that look so much alike, of one shape, whose codes do not contradict each other."""
+    """Pairs near each other that look so much alike, of one shape, whose codes contradict each other on one plate alone."""
     pair = near_pairs(signs.center_world, radius=config.max_distance_m, count=config.candidates)
     a, b = signs[pair[:, 0]], signs[pair[:, 1]]
     contradicts = (a.type >= 0) & (b.type >= 0) & (a.type != b.type)
