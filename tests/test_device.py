@@ -27,8 +27,12 @@ from crowdmap_torch.optim import band_cholesky
 from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.solvers import sparse_tiles, windows
 from crowdmap_torch.processes import sums
+from crowdmap_torch.processes.threads import repeatable
 from crowdmap_torch.single_journey import SingleJourneyMapper, frame_of
 from crowdmap_torch.tables import Dataset, Journey, Lanes, Rows, Signs, to_device
+
+# What torch does in no fixed order there it warns of.
+pytestmark = pytest.mark.filterwarnings("error:.*deterministic")
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +42,7 @@ def transfers(
     """The device is there for all tests of this file, but not for what is made before it: every operation costs more."""
     before = torch.are_deterministic_algorithms_enabled()
     with pretend_device() as counted:
+        repeatable(DEVICE)
         yield counted
     torch.use_deterministic_algorithms(before)
 

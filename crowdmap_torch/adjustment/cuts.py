@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.processes.sums import running_sum
+
 _OVER = 0.1
 """Share of a square's width that a drive goes beyond it before it has left: along a border it is not cut to pieces."""
 _ROAD_M = 50.0
@@ -86,6 +88,6 @@ def convoys(
     count = min(int(total / at_least_m), journeys) if at_least_m else 1
     if count < 2:
         return [(0, journeys)]
-    of = ((driven.cumsum(0) - driven / 2) / total * count).long().clamp_max(count - 1)
+    of = ((running_sum(driven) - driven / 2) / total * count).long().clamp_max(count - 1)
     first = [0, *(torch.nonzero(of.diff())[:, 0] + 1).tolist(), journeys]
     return list(pairwise(first))

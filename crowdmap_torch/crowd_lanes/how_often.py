@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_sum
+from crowdmap_torch.processes.sums import running_sum
 
 _STRETCH_M = 4.0
 _USUAL = 0.75
@@ -64,6 +65,6 @@ def _weighted_quantile(
     order = order[group[order].argsort(stable=True)]
     value, weight, group = value[order], weight[order], group[order]
     total = group_sum(weight, group, groups)
-    before = weight.cumsum(0) - (total.cumsum(0) - total)[group]
+    before = running_sum(weight) - (running_sum(total) - total)[group]
     reached = torch.where(before >= _USUAL * total[group] - 1e-9, value, torch.inf)
     return value.new_full((groups,), torch.inf).scatter_reduce(0, group, reached, "amin")

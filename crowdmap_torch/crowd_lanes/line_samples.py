@@ -14,6 +14,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import distinct_pairs, group_sum
 from crowdmap_torch.clustering.neighbours import pairs_between
 from crowdmap_torch.geometry import spline_basis
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.tables import Rows
 
 _WITNESS_WEIGHT = 0.25
@@ -135,7 +136,7 @@ def stations(
         return point.new_zeros(0), point.new_zeros(count)
     step = (point[1:, :2] - point[:-1, :2]).norm(dim=1)
     step = torch.where(polyline[1:] == polyline[:-1], step, torch.zeros_like(step))
-    s = torch.cat((step.new_zeros(1), step.cumsum(0)))
+    s = torch.cat((step.new_zeros(1), running_sum(step)))
     size = torch.bincount(polyline, minlength=count)
     first = spline_basis.starts(size)
     return s - s[first][polyline], s[first + size - 1] - s[first]

@@ -19,6 +19,7 @@ from crowdmap_torch.crowd_lanes.line_samples import (
 )
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.tables import Lanes
 
 
@@ -176,6 +177,6 @@ def _stations(
     mean_way = torch.nn.functional.normalize(way[1:] + way[:-1], dim=1)
     step = ((middle[1:] - middle[:-1]) * mean_way).sum(1)
     step = torch.where(journey[1:] == journey[:-1], step, torch.zeros_like(step))
-    station = torch.cat((step.new_zeros(1), step)).cumsum(0)
+    station = running_sum(torch.cat((step.new_zeros(1), step)))
     ahead = ((point[:, :2] - middle[stop_of_sample]) * way[stop_of_sample]).sum(1)
     return station[stop_of_sample] + ahead

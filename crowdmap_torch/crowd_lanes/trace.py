@@ -26,6 +26,7 @@ from crowdmap_torch.crowd_lanes.polyline_linking import (
     link_points,
     select_polylines,
 )
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.ranges import Count, Length, Settings, Share
 from crowdmap_torch.tables import LANE_TYPES
 
@@ -174,7 +175,7 @@ def _smooth_kinds(
     # One axis for all polylines, with gaps wider than the window between them.
     far = float(s.max()) + 4 * config.type_window_m if len(s) else 0.0
     x = s + line * far
-    total = torch.cat((votes.new_zeros(1, votes.shape[1]), votes.cumsum(0)))
+    total = torch.cat((votes.new_zeros(1, votes.shape[1]), running_sum(votes)))
     low = torch.searchsorted(x, x - config.type_window_m)
     high = torch.searchsorted(x, x + config.type_window_m, right=True)
     around = total[high] - total[low]

@@ -11,6 +11,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_argmin
 from crowdmap_torch.clustering.neighbours import pairs_between
 from crowdmap_torch.geometry import spline_basis
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.tables import Lanes, Rows
 
 _TOUCH_M = 1e-3
@@ -70,7 +71,7 @@ def sample_polylines(
     first = last - count + 1
     # One arc length through all lines, standing still between one line's end and the next one's
     # start.
-    s = torch.cat((length.new_zeros(1), length.cumsum(0)))
+    s = torch.cat((length.new_zeros(1), running_sum(length)))
     total = s[last] - s[first]
     inner = (total / step_m * (1 - 1e-12)).floor().long() + 1
     number = torch.where(total > 0, inner + 1, 0)

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry.spline_basis import derivative_flat, evaluate_flat, rows
+from crowdmap_torch.processes.sums import running_sum
 
 # Gauss-Legendre on 0 .. 1, five nodes: exact up to degree nine on each half of a span between
 # knots.
@@ -48,7 +49,7 @@ def _parameter_at_length(
 ) -> Tensor:
     part_length, part_spline, part_start = parts
     # One running length over all splines; each starts where the one before ended.
-    running = torch.cat((part_length.new_zeros(1), part_length.cumsum(0)))
+    running = torch.cat((part_length.new_zeros(1), running_sum(part_length)))
     part_count = (count - 1) * _PARTS
     first_part = part_count.cumsum(0) - part_count
     last_part = first_part + part_count - 1

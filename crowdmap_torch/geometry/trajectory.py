@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.processes.sums import running_sum
 
 _HALF_WINDOW_S = 1.5
 """Velocities are those of cubics through the poses up to this far in time: over less the poses' own noise is most of how
@@ -27,7 +28,7 @@ def station(T_world_camera: Float[Tensor, "f 4 4"], *, half_window: int = 7) -> 
     index = torch.arange(len(position), device=position.device)
     ahead, behind = (index + half_window).clamp_max(last), (index - half_window).clamp_min(0)
     speed = (position[ahead] - position[behind]).norm(dim=-1) / (ahead - behind).clamp_min(1)
-    return torch.cat((speed.new_zeros(1), ((speed[1:] + speed[:-1]) / 2).cumsum(0)))[: last + 1]
+    return torch.cat((speed.new_zeros(1), running_sum((speed[1:] + speed[:-1]) / 2)))[: last + 1]
 
 
 def passes(
@@ -55,7 +56,7 @@ def motion(
     if len(T) < 2:
         return torch.zeros_like(T[:, :3, 3]), torch.zeros_like(T[:, :3, 3])
     t_s = (t_ns - t_ns[0]).to(T) * 1e-9
-    turned = se3.so3_log(T[:-1, :3, :3].mT @ T[1:, :3, :3]).cumsum(0)
+    turned = running_sum(se3.so3_log(T[:-1, :3, :3].mT @ T[1:, :3, :3]))
     moved = torch.cat((T[:, :3, 3], torch.cat((torch.zeros_like(turned[:1]), turned))), dim=1)
     low = torch.searchsorted(t_s, t_s - _HALF_WINDOW_S)
     high = torch.searchsorted(t_s, t_s + _HALF_WINDOW_S, right=True)

@@ -13,7 +13,7 @@ from scipy.special import gammainc
 from torch import Tensor
 
 from crowdmap_torch.optim.shared_errors import cut_between_runs
-from crowdmap_torch.processes.sums import add_at
+from crowdmap_torch.processes.sums import add_at, running_sum
 
 _EFFICIENCY = 0.95
 """Of Tukey's weights at normal residuals with the usual c of 4.685 (Holland and Welsch 1977)."""
@@ -227,5 +227,5 @@ def usual(
 ) -> float:
     """Median of values by their weights, beside the weight of what is `assumed` where few values tell."""
     every, order = torch.cat((value, value.new_full((1,), assumed))).sort()
-    below = torch.cat((weight, weight.new_full((1,), beside)))[order].cumsum(0)
+    below = running_sum(torch.cat((weight, weight.new_full((1,), beside)))[order])
     return float(every[torch.searchsorted(below, below[-1:] / 2)])

@@ -19,6 +19,7 @@ from crowdmap_torch.geometry import se3
 from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.plausibility.finding import Finding, Repair
 from crowdmap_torch.plausibility.units import UnitLimits, unit_findings, usual_speed
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.tables import Journey, Origin
 
 
@@ -393,7 +394,7 @@ def _motion(
     Of a car that stands positions tremble: that way adds up, and leads nowhere.
     """
     p = T_world_camera[:, :3, 3]
-    station = torch.cat((p.new_zeros(1), p.diff(dim=0).norm(dim=-1).cumsum(0)))
+    station = torch.cat((p.new_zeros(1), running_sum(p.diff(dim=0).norm(dim=-1))))
     ahead = torch.searchsorted(station, station + limits.baseline_m)
     motion = p[ahead.clamp_max(len(p) - 1)] - p
     return motion, (ahead < len(p)) & (motion.norm(dim=-1) > limits.baseline_m / 2)

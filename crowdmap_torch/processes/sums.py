@@ -8,9 +8,9 @@ and added up in lots, a thread for each, lots of lots, and so on. Few rows are l
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -20,7 +20,6 @@ _LOT = 64
 """Rows that one thread adds up."""
 _MANY = 1 << 17
 """Numbers from which sorting pays."""
-
 
 class _Sorted(NamedTuple):
     """Rows in the order of their indices."""
@@ -41,7 +40,10 @@ def add_at(
     alpha: float = 1.0,
 ) -> Float[Tensor, ...]:
     """As `total.index_add_(dim, index, value, alpha=alpha)`, in place, with the same bits every time on a GPU too."""
-    if not _sorts(total.device) or value.numel() < _MANY or not value.is_floating_point():
+    if not value.is_floating_point():
+        # Whole numbers have one sum in any order; by a factor that is none torch multiplies them into floats on a GPU.
+        return total.index_add_(dim, index, value, alpha=int(alpha))
+    if not _sorts(total.device) or value.numel() < _MANY:
         return total.index_add_(dim, index, value, alpha=alpha)
     by_index, at = _sorted(index), dim % value.ndim
     outer, inner = value.shape[:at], value.shape[at + 1 :]
@@ -56,27 +58,48 @@ def add_at(
         return total.index_add_(dim, by_index.of_lot, rows, alpha=alpha)
 
 
+def running_sum(value: Float[Tensor, "n ..."]) -> Float[Tensor, "n ..."]:
+    """As `value.cumsum(0)`, with the same bits every time on a GPU too: there by sums of twice as many rows each time."""
+    if not _sorts(value.device):
+        return value.cumsum(0)
+    rows = 1
+    while rows < len(value):
+        value = torch.cat((value[:rows], value[rows:] + value[:-rows]))
+        rows *= 2
+    return value
+
+
 def _sorts(device: torch.device) -> bool:
     return device.type != "cpu"
 
 
-_kept: dict[int, tuple[weakref.ref[Tensor], dict[tuple, _Sorted]]] = {}
-"""By the tensor that an index is a view of, as long as it is there."""
+_kept: dict[int, tuple[weakref.ref[Tensor], dict[Hashable, Any]]] = {}
+"""By the tensor that an index is a view of, as long as it is there: what is known of its views."""
 
 
 def _sorted(index: Int[Tensor, " n"]) -> _Sorted:
     """Sorted at first, known again as long as the tensor that it is a view of is there and is not written to."""
-    owner = index if index._base is None else index._base
+    known, view = _of(index)
+    by_index = known.get(view)
+    if by_index is None:
+        by_index = known[view] = _sort(index)
+    return by_index
+
+
+def _of(index: Tensor) -> tuple[dict[Hashable, Any], Hashable]:
+    """What is known of views of the tensor that an index is one of, and which of them it is."""
+    owner = _owner(index)
     number = id(owner)
     found = _kept.get(number)
     if found is None or found[0]() is not owner:
-        found = weakref.ref(owner, lambda _: _kept.pop(number, None)), {}
+        # The table is named here: at the end of a program modules go before tensors.
+        found = weakref.ref(owner, lambda _, kept=_kept: kept.pop(number, None)), {}
         _kept[number] = found
-    key = index.storage_offset(), index.shape, index.stride(), owner._version
-    by_index = found[1].get(key)
-    if by_index is None:
-        by_index = found[1][key] = _sort(index)
-    return by_index
+    return found[1], (index.storage_offset(), index.shape, index.stride(), owner._version)
+
+
+def _owner(index: Tensor) -> Tensor:
+    return index if index._base is None else index._base
 
 
 def _sort(index: Int[Tensor, " n"]) -> _Sorted:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from crowdmap_torch.optim.robust import Tukey
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.road.ego_motion import EgoMotion
 
 _CHORD_M = 20.0
@@ -36,7 +37,7 @@ def headings(motion: EgoMotion) -> Float[Tensor, " f"]:
     """Direction of the road frame's axis ahead, from east to north, without jumps [rad]."""
     ahead = motion.R_world_road[:, :2, 2]
     angle = torch.atan2(ahead[:, 1], ahead[:, 0])
-    return torch.cat((angle[:1], angle[:1] - motion.turn[1:].cumsum(0)))
+    return torch.cat((angle[:1], angle[:1] - running_sum(motion.turn[1:])))
 
 
 def direction(heading: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"]:
@@ -50,9 +51,9 @@ def dead_reckon(
     """East and north of the camera, and height of the road under it, from the first frame on."""
     heading = headings(motion)
     flat = _flat(motion, slope)
-    moved = (flat[:, None] * direction(_middle(heading) + slip.angle)).cumsum(0)
+    moved = running_sum(flat[:, None] * direction(_middle(heading) + slip.angle))
     swing = slip.lever * direction(heading + slip.angle)
-    return moved + swing, (flat * _middle(slope)).cumsum(0)
+    return moved + swing, running_sum(flat * _middle(slope))
 
 
 def fit_slip(motion: EgoMotion, slope: Float[Tensor, " f"]) -> Slip:
@@ -64,7 +65,7 @@ def fit_slip(motion: EgoMotion, slope: Float[Tensor, " f"]) -> Slip:
     starts = torch.ones_like(index[:1], dtype=torch.bool)
     rows = torch.cat((starts, index[1:] > index[:-1])).nonzero()[:, 0]
     first, last = rows[:-1], rows[1:]
-    reckoned = (flat[:, None] * direction(_middle(heading))).cumsum(0)
+    reckoned = running_sum(flat[:, None] * direction(_middle(heading)))
     ahead = direction(heading)
     way = (motion.position[last] - motion.position[first])[:, :2]
     miss = way - (reckoned[last] - reckoned[first])

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.tables import Journey, Rig
 
 
@@ -51,7 +52,7 @@ class EgoMotion:
     @property
     def station(self) -> Float[Tensor, " f"]:
         """Way ahead since the first frame [m]."""
-        return self.advance.cumsum(0)
+        return running_sum(self.advance)
 
 
 def motion_of(journey: Journey) -> EgoMotion:

@@ -168,7 +168,7 @@ class RoadTracker:
         self, part: Journey, motion: EgoMotion, dt: Float[Tensor, " f"], memory: _Memory
     ) -> tuple[RoadEstimate, _Memory]:
         c = self._config.coplanarity
-        walked = memory.so_far.station + motion.advance.cumsum(0)
+        walked = memory.so_far.station + motion.station
         station = torch.cat((memory.so_far.station[None], walked)).cummax(0)[0]
         nodes = concatenate((memory.nodes, pick_nodes(motion, station, c)))
         update = (station / c.update_m).floor()

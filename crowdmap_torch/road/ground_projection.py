@@ -10,6 +10,7 @@ from torch import Tensor
 
 from crowdmap_torch.geometry import camera as camera_module
 from crowdmap_torch.geometry.plane import ground_points
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.road.ego_motion import EgoMotion, motion_of, slopes_of_normal
 from crowdmap_torch.road.surface import DriveSurface, SurfacePoints, intersect, lay_surface
 from crowdmap_torch.tables import Journey, LanePoints, RoadEstimate, Rows
@@ -142,7 +143,7 @@ def _nearest_view(
 def _shift(surface: DriveSurface, station: Float[Tensor, " p"]) -> Float[Tensor, "p 3"]:
     """Measured minus reckoned position, the mean over the frames around a place on the way."""
     at = surface.station.contiguous()
-    total = torch.cat((surface.shift[:1] * 0, surface.shift.cumsum(0)))
+    total = torch.cat((surface.shift[:1] * 0, running_sum(surface.shift)))
     half = _SHIFT_WINDOW_M / 2
     low = torch.searchsorted(at, (station - half).contiguous())
     high = torch.searchsorted(at, (station + half).contiguous(), right=True)

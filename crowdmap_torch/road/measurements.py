@@ -81,7 +81,7 @@ def take_measurements(
     config: MeasurementConfig,
 ) -> tuple[Measurements, MeasurementState]:
     """The measurements of frames that follow on `so_far`, and what the frames after them need."""
-    walked = so_far.station + motion.advance.cumsum(0)
+    walked = so_far.station + motion.station
     station = torch.cummax(torch.cat((so_far.station[None], walked)), 0)[0]
     # The springs shake with a memory: over many frames it averages out more slowly than white noise.
     longer = (2 * config.shaking_memory_s / dt.clamp_min(1e-3)).clamp_min(1)

@@ -16,6 +16,7 @@ from torch import Tensor
 from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.noise.positioning import DriftPathConfig, PositioningNoise, knot_count
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.ranges import Settings, Sigma
 from crowdmap_torch.residuals.pose import sideways_parting
 from crowdmap_torch.road.dead_reckoning import dead_reckon, direction, fit_slip, headings
@@ -96,7 +97,7 @@ def nonholonomic_term(
     habits = torch.cat((advance, swing), dim=-1) / 2
     by_before = torch.cat((-sideways, -turn, -habits), dim=-1)
     by_after = torch.cat((sideways, -turn, -habits), dim=-1)
-    blind = mean((config.blind_sigma * level.advance.square()).square().cumsum(0)[:, None])[:, 0]
+    blind = mean(running_sum((config.blind_sigma * level.advance.square()).square())[:, None])[:, 0]
     noise = positioning.white_sigma_m**2 * (1 / number[before] + 1 / number[after])
     slide = (config.slide_sigma * advance[:, 0]).square()
     sigma = (noise + slide + blind[after] - blind[before]).sqrt()

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from crowdmap_torch.processes import sums
-from crowdmap_torch.processes.sums import add_at
+from crowdmap_torch.processes.sums import add_at, running_sum
 
 
 @pytest.fixture(autouse=True)
@@ -87,3 +87,10 @@ def test_what_was_sorted_goes_with_its_index():
     del index
     gc.collect()
     assert len(sums._kept) == before
+
+
+@pytest.mark.parametrize("rows", [0, 1, 2, 3, 64, 1001])
+@pytest.mark.parametrize("columns", [(), (3,)])
+def test_running_sums_are_those_of_one_row_after_the_other(rows: int, columns: tuple[int, ...]):
+    value = drawn(rows, *columns)
+    torch.testing.assert_close(running_sum(value), value.cumsum(0), rtol=1e-12, atol=1e-12)

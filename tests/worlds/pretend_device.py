@@ -7,6 +7,7 @@ back are counted.
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +24,9 @@ from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_a
 DEVICE = torch.device("cuda:0")
 _GET_DEVICE = vars(torch._C.TensorBase)["device"].__get__
 _GET_IS_CUDA = vars(torch._C.TensorBase)["is_cuda"].__get__
+
+_IN_NO_ORDER = ("cumsum", "cumsum_", "histc", "put", "put_", "kthvalue")
+"""Operations on floats that torch has on a GPU only in no fixed order."""
 
 
 @dataclass
@@ -136,6 +140,8 @@ class _Operations(TorchDispatchMode):
                     raise RuntimeError(
                         f"{func}: expected all tensors on one device, found {DEVICE} and cpu"
                     )
+        if there:
+            _as_cuda_would(name, args, kwargs)
         if name == "_local_scalar_dense":
             self.transfers.scalars += there
         held_args, held = _with(args, _held), _with(kwargs, _held)
@@ -227,6 +233,22 @@ class _Calls(TorchFunctionMode):
             if isinstance(tensor, PretendTensor)
             else PretendTensor(tensor.clone())
         )
+
+
+def _as_cuda_would(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    """Fails and warns as CUDA's operations do where sums are to have one order, and those of a CPU do not."""
+    if not torch.are_deterministic_algorithms_enabled():
+        return
+    value = args[0]
+    if name.startswith("index_add") and not value.is_floating_point():
+        # It is multiplied by the factor, and put into the sum after that.
+        if isinstance(kwargs.get("alpha", 1), float):
+            raise RuntimeError(f"{name}: expected scalar type Float but found {value.dtype}")
+    weighted = name == "bincount" and len(_tensors([*args, *kwargs.values()])) > 1
+    in_no_order = name in _IN_NO_ORDER and isinstance(value, Tensor) and value.is_floating_point()
+    by_place = name == "median" and len(args) > 1
+    if weighted or in_no_order or by_place:
+        warnings.warn(f"{name} on CUDA does not have a deterministic implementation", stacklevel=2)
 
 
 def _is_there(tensor: Tensor) -> bool:
