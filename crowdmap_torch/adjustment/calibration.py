@@ -31,6 +31,7 @@ from crowdmap_torch.geometry.camera import Camera
 from crowdmap_torch.geometry.trajectory import motion
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.problem import CostTerm
+from crowdmap_torch.processes.sums import lasting
 from crowdmap_torch.ranges import Degrees, LengthOrNone, PixelsOrNone, Settings, Share
 from crowdmap_torch.residuals.calibration import with_linear_part
 from crowdmap_torch.residuals.lane import (
@@ -222,7 +223,8 @@ class Fleet:
 
     def new(self, kind: Kind) -> Int[Tensor, " n"]:
         """The cars of which nothing of that kind was found before."""
-        return torch.nonzero(~self.found_before[kind.variable][:, kind.at.start])[:, 0]
+        before = self.found_before[kind.variable][:, kind.at.start]
+        return lasting("new", lambda: torch.nonzero(~before)[:, 0], before)
 
     def of_poses(self, term: CostTerm, by: Float[Tensor, "p 6 k"]) -> CostTerm:
         """`pose_white`, of the pose that a true mount and clock would give; `by` is `by_mount` of the poses."""

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.robust import Loss, Quadratic
 from crowdmap_torch.optim.shared_errors import SharedErrors
+from crowdmap_torch.processes.sums import lasting
 from crowdmap_torch.processes.together import ALONE, Together
 
 Values = Mapping[str, Tensor]
@@ -138,7 +139,7 @@ class Problem:
         """The independent problem of each row; None where there is one problem."""
         name, block = term.slots[0]
         group = self.variables[name].group
-        return None if group is None else group[block]
+        return None if group is None else lasting("group", lambda: group[block], block, group)
 
 
 def retract(problem: Problem, values: Values, delta: Mapping[str, Tensor]) -> dict[str, Tensor]:

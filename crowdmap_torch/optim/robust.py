@@ -13,7 +13,7 @@ from scipy.special import gammainc
 from torch import Tensor
 
 from crowdmap_torch.optim.shared_errors import cut_between_runs
-from crowdmap_torch.processes.sums import add_at, running_sum
+from crowdmap_torch.processes.sums import add_at, lasting, running_sum
 
 _EFFICIENCY = 0.95
 """Of Tukey's weights at normal residuals with the usual c of 4.685 (Holland and Welsch 1977)."""
@@ -174,7 +174,7 @@ class JointTukey:
         """The sum over each row's detection."""
         if not len(s):
             return s
-        own = self.run - self.run[0]
+        own = lasting("own", lambda: self.run - self.run[0], self.run)
         # As many as there are rows are enough: how many there are is not asked for, which would stop a GPU.
         total = torch.zeros_like(s)
         return add_at(total, 0, own, s)[own]

@@ -8,9 +8,9 @@ and added up in lots, a thread for each, lots of lots, and so on. Few rows are l
 from __future__ import annotations
 
 import weakref
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -20,6 +20,9 @@ _LOT = 64
 """Rows that one thread adds up."""
 _MANY = 1 << 17
 """Numbers from which sorting pays."""
+
+T = TypeVar("T")
+
 
 class _Sorted(NamedTuple):
     """Rows in the order of their indices."""
@@ -75,6 +78,24 @@ def _sorts(device: torch.device) -> bool:
 
 _kept: dict[int, tuple[weakref.ref[Tensor], dict[Hashable, Any]]] = {}
 """By the tensor that an index is a view of, as long as it is there: what is known of its views."""
+
+
+def lasting(name: Hashable, make: Callable[[], T], first: Tensor, *others: Tensor) -> T:
+    """What `make` derives, under this `name`, of indices that last, and of nothing else that changes.
+
+    On a GPU it is made once and known again as long as they are there and are not written to, so that sums by it are sorted
+    once; on a CPU, where nothing is sorted, every time. It goes with the `first`, which is to be that of the shortest life.
+    """
+    if not _sorts(first.device):
+        return make()
+    known, view = _of(first)
+    key = name, view, *((id(_owner(x)), _of(x)[1]) for x in others)
+    found = known.get(key)
+    if found is None or any(
+        one() is not _owner(x) for one, x in zip(found[0], others, strict=True)
+    ):
+        found = known[key] = tuple(weakref.ref(_owner(x)) for x in others), make()
+    return found[1]
 
 
 def _sorted(index: Int[Tensor, " n"]) -> _Sorted:

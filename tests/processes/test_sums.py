@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from crowdmap_torch.processes import sums
-from crowdmap_torch.processes.sums import add_at, running_sum
+from crowdmap_torch.processes.sums import add_at, lasting, running_sum
 
 
 @pytest.fixture(autouse=True)
@@ -94,3 +94,47 @@ def test_what_was_sorted_goes_with_its_index():
 def test_running_sums_are_those_of_one_row_after_the_other(rows: int, columns: tuple[int, ...]):
     value = drawn(rows, *columns)
     torch.testing.assert_close(running_sum(value), value.cumsum(0), rtol=1e-12, atol=1e-12)
+
+
+def test_what_is_derived_of_indices_that_last_is_made_once():
+    made: list[int] = []
+
+    def twice(index: Tensor, beside: Tensor) -> Tensor:
+        def make() -> Tensor:
+            made.append(len(made))
+            return 2 * index + beside[0]
+
+        return lasting("twice", make, index, beside)
+
+    index, beside = indices(30, 4), indices(5, 9)
+    assert twice(index[3:], beside) is twice(index[3:], beside)
+    assert torch.equal(twice(index[3:], beside), 2 * index[3:] + beside[0])
+    assert len(made) == 1
+    # Of other indices, or where one was written to, it is another.
+    assert twice(index, beside) is not twice(index[3:], beside)
+    other = beside + 1
+    assert torch.equal(twice(index, other), 2 * index + other[0])
+    beside += 3
+    assert torch.equal(twice(index, beside), 2 * index + beside[0])
+    assert lasting("thrice", lambda: 3 * index, index, beside) is not twice(index, beside)
+
+
+def test_what_is_derived_goes_with_the_first_and_is_not_taken_for_that_of_another():
+    before = len(sums._kept)
+    index = indices(30, 4)
+    for seed in range(20):
+        # Python likes to give the next tensor the number of the last one.
+        beside = indices(5, 9, seed)
+        found = lasting("sum", lambda beside=beside: index + beside[0], index, beside)
+        assert torch.equal(found, index + beside[0])
+        del beside
+    del index
+    gc.collect()
+    assert len(sums._kept) == before
+
+
+def test_nothing_is_kept_on_a_cpu(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sums, "_sorts", lambda device: False)
+    before, index = len(sums._kept), indices(30, 4)
+    made = [lasting("same", index.clone, index) for _ in range(2)]
+    assert made[0] is not made[1] and len(sums._kept) == before

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from crowdmap_torch.optim.linearize import RowBlocks, chunks, row_gradients, rows
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
-from crowdmap_torch.processes.sums import add_at
+from crowdmap_torch.processes.sums import add_at, lasting
 from crowdmap_torch.processes.threads import in_order
 
 _Linearize = Callable[[CostTerm, Mapping[str, Variable], Values], RowBlocks]
@@ -39,12 +39,20 @@ class RowGroups:
         if self.of_row is None or chunk.at.start == chunk.at.stop:
             return chunk
         group = self.of_row[chunk.at]
-        first, last = int(group[0]), int(group[-1])
-        begins = torch.ones_like(group, dtype=torch.bool)
-        begins[1:] = group[1:] != group[:-1]
-        slots = tuple((name, block[begins]) for name, block in chunk.slots)
-        blocks = chunk.blocks.added_up(group - first, last - first + 1)
-        return TermRows(chunk.term, slice(first, last + 1), slots, blocks)
+        of, begins, at = lasting("groups", lambda: _runs(group), group)
+        slots = tuple(
+            (name, lasting("begins", lambda block=block: block[begins], block, group))
+            for name, block in chunk.slots
+        )
+        return TermRows(chunk.term, at, slots, chunk.blocks.added_up(of, at.stop - at.start))
+
+
+def _runs(group: Int[Tensor, " m"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " g"], slice]:
+    """Groups that follow on each other, counted from the first on; the first row of each; and which they are."""
+    first, last = int(group[0]), int(group[-1])
+    begins = torch.ones_like(group, dtype=torch.bool)
+    begins[1:] = group[1:] != group[:-1]
+    return group - first, torch.nonzero(begins)[:, 0], slice(first, last + 1)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from torch import Tensor
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
 from crowdmap_torch.optim.solvers.windows import Batch, Product, Round
 from crowdmap_torch.processes.amounts import at_once
-from crowdmap_torch.processes.sums import add_at
+from crowdmap_torch.processes.sums import add_at, lasting
 from crowdmap_torch.processes.threads import in_order
 
 
@@ -89,19 +89,26 @@ def solve_rounds(
     The places are counted from the first of these rounds on.
     """
     gone = rounds[0].place.start if rounds else 0
-    for of_round, lead in zip(rounds, leads, strict=True):
+    left = [_left(of_round.neighbour, gone) for of_round in rounds]
+    for of_round, neighbour, lead in zip(rounds, left, leads, strict=True):
         for some, own in _by_lots(of_round, gone, rest):
             whitened = lead.whiten[some] @ rest[own]
             rest[own] = whitened
             fill = _turned(lead.towards[some], whitened).view(-1, *rest.shape[1:])
-            add_at(rest, 0, of_round.neighbour[some].flatten() - gone, fill)
+            add_at(rest, 0, neighbour[some].flatten(), fill)
     # Back in the same memory: neighbours went later, and the last place is nobody's.
     rest[-1] = 0
-    for of_round, lead in zip(reversed(rounds), reversed(leads), strict=True):
+    backwards = zip(reversed(rounds), reversed(left), reversed(leads), strict=True)
+    for of_round, neighbour, lead in backwards:
         for some, own in _by_lots(of_round, gone, rest):
-            beside = rest[of_round.neighbour[some] - gone].flatten(1, 2)
+            beside = rest[neighbour[some]].flatten(1, 2)
             rest[own] = _turned(lead.whiten[some], rest[own] + lead.towards[some] @ beside)
     return rest
+
+
+def _left(neighbour: Int[Tensor, "e s"], gone: int) -> Int[Tensor, "e s"]:
+    """Places of neighbours, counted behind those that are `gone`."""
+    return lasting(("left", gone), lambda: neighbour - gone, neighbour) if gone else neighbour
 
 
 def _by_lots(
@@ -150,7 +157,9 @@ def eliminate(
     scattered = None
     if batch.products is None:
         product = (wide @ wide.mT).neg_()
-        scattered = pattern.squares(batch.columns).flatten(), product.flatten()
+        columns = batch.columns
+        at = lasting("at", lambda: pattern.squares(columns).flatten(), columns, pattern.base)
+        scattered = at, product.flatten()
     return Eliminated(fill, wide, scattered)
 
 

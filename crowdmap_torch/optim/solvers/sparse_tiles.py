@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crowdmap_torch.processes.sums import add_at
+from crowdmap_torch.processes.sums import add_at, lasting
 
 _ONE_TILE = 768
 """Unknowns up to which one tile holds everything."""
@@ -188,10 +188,15 @@ class TileMatrix:
         self, row: Int[Tensor, " m"], column: Int[Tensor, " m"], block: Float[Tensor, "k l m"]
     ) -> None:
         """Adds blocks, each from its row and column on, in place; what is below the diagonal's tiles is left out."""
-        height, width, _ = block.shape
-        down = torch.arange(height, device=row.device)[:, None, None]
-        right = torch.arange(width, device=row.device)[:, None]
-        add_at(self.flat, 0, self.pattern.at(row + down, column + right).flatten(), block.flatten())
+        pattern, (height, width, _) = self.pattern, block.shape
+
+        def places() -> Int[Tensor, " n"]:
+            down = torch.arange(height, device=row.device)[:, None, None]
+            right = torch.arange(width, device=row.device)[:, None]
+            return pattern.at(row + down, column + right).flatten()
+
+        at = lasting(("places", height, width), places, row, column, pattern.base)
+        add_at(self.flat, 0, at, block.flatten())
 
     def read(self, row: Int[Tensor, ...], column: Int[Tensor, ...]) -> Float[Tensor, ...]:
         """Entries, rows and columns broadcast; ValueError where there is no tile."""
