@@ -109,30 +109,30 @@ def prior_information(prior: Variances) -> Float[Tensor, "n n"]:
 
 
 def scale_of(
-    value: Float[Tensor, " n"], covariance: Float[Tensor, "n n"], scale: Float[Tensor, ""]
-) -> Float[Tensor, ""]:
-    """What the sigmas of numbers that are 1 as configured are to be multiplied by.
+    value: Float[Tensor, "*b n"], covariance: Float[Tensor, "*b n n"], scale: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b"]:
+    """What the sigmas of numbers that are 1 as configured are to be multiplied by, of many sets of numbers at once.
 
     `value` and `covariance` are what was found of them with sigmas of `scale`.
     """
     left, axes = torch.linalg.eigh(covariance)
     left = left.clamp_min(1e-12)
-    told = (1 / left - scale**-2).clamp_min(_LEAST_TOLD)
-    mean = (axes.mT @ value / left).square()
+    told = (1 / left - scale[..., None] ** -2).clamp_min(_LEAST_TOLD)[..., None, :]
+    mean = ((axes.mT @ value[..., None])[..., 0] / left).square()[..., None, :]
     least, most, count = _SCALES
     like = {"dtype": value.dtype, "device": value.device}
     s = torch.linspace(math.log(least), math.log(most), count, **like).exp()
     square = s.square()[:, None]
     gain = 1 + told * square
-    evidence = (mean * square / gain - gain.log()).sum(1) / 2 - s.square() / 2
+    evidence = (mean * square / gain - gain.log()).sum(-1) / 2 - s.square() / 2
     # Steps of even logarithms are as wide as the scale is large.
-    weight = torch.softmax(evidence + s.log(), 0)
-    determined = (told * square / gain).sum(1)
-    wanted = (weight * determined).sum()
-    behind = torch.searchsorted(determined, wanted[None]).clamp(1, count - 1)
-    around = torch.cat((behind - 1, behind))
-    below, above = determined[around].unbind(0)
-    low, high = s[around].unbind(0)
+    weight = torch.softmax(evidence + s.log(), -1)
+    determined = (told * square / gain).sum(-1)
+    wanted = (weight * determined).sum(-1)
+    behind = torch.searchsorted(determined, wanted[..., None]).clamp(1, count - 1)
+    around = torch.cat((behind - 1, behind), dim=-1)
+    below, above = determined.gather(-1, around).unbind(-1)
+    low, high = s[around].unbind(-1)
     return low * (high / low) ** ((wanted - below) / (above - below))
 
 
@@ -144,24 +144,34 @@ def _of_kinds(
     scale: Float[Tensor, " kinds"],
 ) -> Float[Tensor, " kinds"]:
     """The scale of what cars differ in, of every kind that is new of two cars or more, found with `prior` and `scale`."""
-    found, first = scale.clone(), 0
-    sigma = prior.own.sqrt()
+    found, sigma = scale.clone(), prior.own.sqrt()
+    # Kinds of as many numbers, and of as many cars, at once.
+    alike: dict[tuple[int, int], list[tuple[int, Tensor, range]]] = {}
+    first = 0
     for number, kind in enumerate(fleet.kinds):
         new, count = fleet.new(kind), kind.at.stop - kind.at.start
-        at = torch.arange(first, first + count, device=new.device)
+        if len(new) > 1:
+            some = alike.setdefault((len(new), count), [])
+            some.append((number, new, range(first, first + count)))
         first += count
-        if len(new) < 2:
-            continue
+    for (cars, _), some in alike.items():
+        numbers, every, places = zip(*some, strict=True)
+        of_kind = torch.tensor(numbers, device=scale.device)
+        new, at = torch.stack(every), torch.tensor(places, device=scale.device)
         # Whatever is at right angles to the mean of the cars, each in its own sigmas but for the scale.
-        eye = torch.eye(len(new)).to(value)
+        eye = torch.eye(cars).to(value)
         basis = torch.linalg.qr(torch.cat((torch.ones_like(eye[:, :1]), eye[:, 1:]), dim=1)).Q
-        basis = basis[:, None, 1:] * (scale[number] / sigma[new[:, None], at])[..., None]
-        joint = covariance[new[:, None], at][..., new[:, None], at]
-        differences = torch.einsum("aiq,ai->iq", basis, value[new[:, None], at])
-        of_them = torch.einsum("aiq,aibj,bjr->iqjr", basis, joint, basis)
-        found[number] = scale_of(
-            differences.flatten(), of_them.reshape(differences.numel(), -1), scale[number]
-        ).clamp_max(1)
+        row, column = new[:, :, None], at[:, None]
+        units = scale[of_kind, None, None] / sigma[row, column]
+        basis = basis[:, None, 1:] * units[..., None]
+        joint = covariance[
+            row[..., None, None], column[..., None, None], row[:, None, None], column[:, None, None]
+        ]
+        differences = torch.einsum("kaiq,kai->kiq", basis, value[row, column])
+        of_them = torch.einsum("kaiq,kaibj,kbjr->kiqjr", basis, joint, basis)
+        told = differences.flatten(1)
+        of_them = of_them.reshape(*told.shape, told.shape[1])
+        found[of_kind] = scale_of(told, of_them, scale[of_kind]).clamp_max(1)
     return found
 
 

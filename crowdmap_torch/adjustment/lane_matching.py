@@ -15,6 +15,7 @@ from crowdmap_torch.adjustment.observations import LanePointObservations
 from crowdmap_torch.clustering.neighbours import layered
 from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.geometry import spline_basis
+from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.threads import in_order
 from crowdmap_torch.residuals.reprojection import MIN_DEPTH
 from crowdmap_torch.tables import Lanes, Rows, Tracklets, concatenate
@@ -22,7 +23,7 @@ from crowdmap_torch.tables import Lanes, Rows, Tracklets, concatenate
 _STEPS = 4
 """Gauss-Newton steps along the projected spline; it is nearly straight at a lane point's scale."""
 _AT_ONCE = 1 << 14
-"""Lane points that are followed at once."""
+"""Lane points that are followed at once on a CPU."""
 _SLACK = 0.05
 """Knots beyond a spline's end at which a match is lost, and within it at which a lost one is taken up again."""
 
@@ -166,7 +167,8 @@ def follow(
         first = None if begun is None else begun[at]
         return _followed(matches[at], observations[at], *where, own, first)
 
-    every = [slice(a, a + _AT_ONCE) for a in range(0, len(matches), _AT_ONCE)]
+    lot = at_once(_AT_ONCE, coefficient.device)
+    every = [slice(a, a + lot) for a in range(0, len(matches), lot)]
     return concatenate(list(in_order(some, every, coefficient.device))) if every else matches
 
 

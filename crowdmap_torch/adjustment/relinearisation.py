@@ -15,10 +15,11 @@ from crowdmap_torch.adjustment.lenses import relinearised, rows_by_lens
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.threads import in_order
 
 _AT_ONCE = 1 << 14
-"""Rows that are seen to at once."""
+"""Rows that are seen to at once on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +80,11 @@ def relinearise(
 
 def _pieces(label: Int[Tensor, " m"]) -> list[slice]:
     """Some rows after the other, those of a label, which are adjacent, in one piece."""
-    if len(label) <= _AT_ONCE:
+    lot = at_once(_AT_ONCE, label.device)
+    if len(label) <= lot:
         return [slice(0, len(label))] if len(label) else []
     begins = torch.nonzero(label[1:] != label[:-1])[:, 0] + 1
-    wanted = torch.arange(_AT_ONCE, len(label), _AT_ONCE, device=label.device)
+    wanted = torch.arange(lot, len(label), lot, device=label.device)
     at = torch.searchsorted(begins, wanted)
     cuts = begins[at[at < len(begins)]].unique().tolist()
     return [slice(a, b) for a, b in zip([0, *cuts], [*cuts, len(label)], strict=True)]

@@ -21,11 +21,12 @@ from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
 from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
+from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 _AT_ONCE = 1 << 13
-"""Leaves whose blocks are computed together."""
+"""Leaves whose blocks are computed together on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,8 @@ class KnownLandmarks:
             left = alone + lags @ of_carrier[by] @ lags.mT
             return left.diagonal(dim1=-2, dim2=-1)[:, :width]
 
-        bounds = [*range(0, max(plan.leaf_count, 1), _AT_ONCE), plan.leaf_count]
+        lot = at_once(_AT_ONCE, of_chain.device)
+        bounds = [*range(0, max(plan.leaf_count, 1), lot), plan.leaf_count]
         some = [slice(a, b) for a, b in pairwise(bounds)]
         return torch.cat(list(in_order(of_some, some, of_chain.device)))
 
