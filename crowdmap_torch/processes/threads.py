@@ -12,9 +12,11 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
+from itertools import islice
+from typing import Generic, TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
@@ -82,7 +84,8 @@ def in_order(
             yield from map(function, items)
         return
     with one_core_each():
-        pool = _pool(threads)
+        # This thread is one of them.
+        pool = _pool(threads - 1)
         gradients = torch.is_grad_enabled()
 
         def run(item: T) -> R:
@@ -90,17 +93,47 @@ def in_order(
             with torch.set_grad_enabled(gradients):
                 return function(item)
 
-        waiting: deque[Future[R]] = deque()
+        waiting: deque[_Task[T, R]] = deque()
         try:
             for item in items:
-                waiting.append(pool.submit(run, item))
+                waiting.append(_Task(item, pool.submit(run, item)))
                 if len(waiting) > _AHEAD * threads:
-                    yield waiting.popleft().result()
+                    yield _first(waiting, run)
             while waiting:
-                yield waiting.popleft().result()
+                yield _first(waiting, run)
         finally:
-            for future in waiting:
-                future.cancel()
+            for task in waiting:
+                task.future.cancel()
+
+
+@dataclass
+class _Task(Generic[T, R]):
+    """An item, and what is to come of it."""
+
+    item: T
+    future: Future[R]
+
+
+def _first(waiting: deque[_Task[T, R]], run: Callable[[T], R]) -> R:
+    """What comes of the first task, which goes; this thread sees to others that nobody has begun, until it is there."""
+    for number, task in enumerate(waiting):
+        if waiting[0].future.done():
+            break
+        # What another thread has begun, or this one has done, is not taken back.
+        if task.future.cancel():
+            task.future = Future()
+            with ExitStack() as if_it_fails:
+                # Of several errors the first is told.
+                if_it_fails.callback(_all_done, list(islice(waiting, number)))
+                task.future.set_result(run(task.item))
+                if_it_fails.pop_all()
+    return waiting.popleft().future.result()
+
+
+def _all_done(tasks: Sequence[_Task[T, R]]) -> None:
+    """Raises the first error of some tasks."""
+    for task in tasks:
+        task.future.result()
 
 
 @lru_cache(maxsize=1)
