@@ -6,34 +6,22 @@ import resource
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
-_STATUS, _FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+from crowdmap_torch.processes.memory import peak_bytes, restart_peak
 
 
 @contextmanager
 def spent(into: dict[str, dict[str, float]], stage: str) -> Iterator[None]:
     """Notes `{"seconds": ..., "peak_mb": ...}` of what is done inside under the stage's name.
 
-    The peak is the process's own, counted from here on; where the system does not tell that, from its start on.
+    The peak is the process's own, counted from here on; where the system does not forget what was before, from its start on.
     """
-    _forget_peak()
+    restart_peak()
     begun = time.process_time()
     yield
     into[stage] = {"seconds": time.process_time() - begun, "peak_mb": _peak_mb()}
 
 
-def _forget_peak() -> None:
-    """Sets the peak to what is held now (proc(5)); where that is not allowed it goes on from before."""
-    try:
-        _FORGET.write_text("5")
-    except OSError:
-        return
-
-
 def _peak_mb() -> float:
-    if _STATUS.exists():
-        for line in _STATUS.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1e3
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    peak = peak_bytes()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3 if peak is None else peak / 1e6

@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 
 import pytest
+from worlds.held_memory import held
 
 from crowdmap_torch.processes.memory import peak_bytes
 from crowdmap_torch.report import progress
@@ -36,12 +37,11 @@ def test_a_stage_has_the_seconds_between_its_name_and_the_next(clock):
 def test_a_stage_has_the_memory_that_it_held_and_not_what_one_before_it_did():
     told = Progress(io.StringIO())
     told("much")
-    much = bytearray(200_000_000)
-    told("little")
-    del much
+    with held(200_000_000):
+        told("little")
     told("less")
     told.finish()
-    assert told.peak_gb["much"] - told.peak_gb["less"] == pytest.approx(0.2, abs=0.1)
+    assert told.peak_gb["much"] - told.peak_gb["less"] == pytest.approx(0.2, abs=0.03)
 
 
 def test_without_a_terminal_lines_come_seldom_and_at_the_end(clock):
