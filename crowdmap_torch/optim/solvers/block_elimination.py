@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from crowdmap_torch.optim.linearize import sum_of_products
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
 from crowdmap_torch.optim.solvers.windows import Batch, Product, Round
 from crowdmap_torch.processes.amounts import at_once
@@ -25,7 +26,7 @@ from crowdmap_torch.processes.threads import in_order
 
 @dataclass(frozen=True)
 class Lead:
-    """What the elimination of a round leaves to other blocks of its chains."""
+    """What the elimination of a round leaves to other blocks of its chains, block by block, while the round lasts."""
 
     whiten: Float[Tensor, "e k k"]
     """W, the inverse Cholesky factors of the diagonals."""
@@ -36,6 +37,26 @@ class Lead:
         """To be added to the neighbours' diagonals and to the link between them."""
         V = self.towards
         return torch.baddbmm(V.new_zeros(1, 1, 1), V.mT, V, beta=0, alpha=-1)
+
+    def kept(self) -> KeptLead:
+        """The same for later solves."""
+        both = torch.cat((self.whiten, self.towards), dim=-1).permute(1, 2, 0).contiguous()
+        k = len(both)
+        return KeptLead(both[:, :k], both[:, k:])
+
+
+@dataclass(frozen=True)
+class KeptLead:
+    """What a round leaves behind for good, with the blocks as the last axis: solves take as long as reading it does."""
+
+    whiten: Float[Tensor, "k k e"]
+    """W."""
+    towards: Float[Tensor, "k _ e"]
+    """V."""
+
+    def blocks(self) -> Lead:
+        """The same block by block."""
+        return Lead(*(x.permute(2, 0, 1).contiguous() for x in (self.whiten, self.towards)))
 
 
 def lead_of(
@@ -71,60 +92,60 @@ def fill_chain(
 
 def leads_of(
     rounds: Sequence[Round], diagonal: Float[Tensor, "p k k"], link: Float[Tensor, "p k k"]
-) -> tuple[Lead, ...]:
+) -> tuple[KeptLead, ...]:
     """What all rounds leave behind of themselves; the blocks, by place, are changed."""
     leads = []
     for of_round in rounds:
         lead = lead_of(of_round, diagonal, link)
         fill_chain(of_round, lead.square(), diagonal, link)
-        leads.append(lead)
+        leads.append(lead.kept())
     return tuple(leads)
 
 
 def solve_rounds(
-    rounds: Sequence[Round], leads: Sequence[Lead], rest: Float[Tensor, "p k c"]
+    rounds: Sequence[Round], leads: Sequence[KeptLead], rest: Float[Tensor, "p k c"]
 ) -> Float[Tensor, "p k c"]:
-    """A^-1 of right-hand sides by place, forth and back through rounds, the last ones of all, in the memory of `rest`.
+    """A^-1 of right-hand sides by place, forth and back through rounds, the last ones of all.
 
     The places are counted from the first of these rounds on.
     """
     gone = rounds[0].place.start if rounds else 0
     left = [_left(of_round.neighbour, gone) for of_round in rounds]
+    rest = rest.permute(1, 2, 0).contiguous()
+    flat = rest.flatten(0, 1)
     for of_round, neighbour, lead in zip(rounds, left, leads, strict=True):
         for some, own in _by_lots(of_round, gone, rest):
-            whitened = lead.whiten[some] @ rest[own]
-            rest[own] = whitened
-            fill = _turned(lead.towards[some], whitened).view(-1, *rest.shape[1:])
-            add_at(rest, 0, neighbour[some].flatten(), fill)
+            whitened = sum_of_products(lead.whiten[..., some].transpose(0, 1), rest[..., own])
+            rest[..., own] = whitened
+            fill = sum_of_products(lead.towards[..., some], whitened)
+            for side, at in zip(fill.split(len(rest)), neighbour, strict=True):
+                add_at(flat, 1, at[some], side.flatten(0, 1))
     # Back in the same memory: neighbours went later, and the last place is nobody's.
-    rest[-1] = 0
+    rest[..., -1] = 0
     backwards = zip(reversed(rounds), reversed(left), reversed(leads), strict=True)
     for of_round, neighbour, lead in backwards:
         for some, own in _by_lots(of_round, gone, rest):
-            beside = rest[neighbour[some]].flatten(1, 2)
-            rest[own] = _turned(lead.whiten[some], rest[own] + lead.towards[some] @ beside)
-    return rest
+            here = (at[some].expand(len(flat), -1) for at in neighbour)
+            beside = torch.cat([flat.gather(1, at).view(*rest.shape[:2], -1) for at in here])
+            moved = sum_of_products(lead.towards[..., some].transpose(0, 1), beside)
+            rest[..., own] = sum_of_products(lead.whiten[..., some], moved.add_(rest[..., own]))
+    return rest.permute(2, 0, 1)
 
 
-def _left(neighbour: Int[Tensor, "e s"], gone: int) -> Int[Tensor, "e s"]:
-    """Places of neighbours, counted behind those that are `gone`."""
-    return lasting(("left", gone), lambda: neighbour - gone, neighbour) if gone else neighbour
+def _left(neighbour: Int[Tensor, "e s"], gone: int) -> Int[Tensor, "s e"]:
+    """Places of neighbours by side, counted behind those that are `gone`."""
+    return lasting(("left", gone), lambda: (neighbour.mT - gone).contiguous(), neighbour)
 
 
 def _by_lots(
-    of_round: Round, gone: int, rest: Float[Tensor, "p k c"]
+    of_round: Round, gone: int, rest: Float[Tensor, "k c p"]
 ) -> Iterator[tuple[slice, slice]]:
     """The blocks of a round and their places in `rest`, as many at once as suit the device."""
     first, count = of_round.place.start - gone, of_round.place.stop - of_round.place.start
-    size = max(1, at_once(_LOT, rest.device) // max(rest[:1].numel(), 1))
+    size = max(1, at_once(_LOT, rest.device) // max(rest[..., :1].numel(), 1))
     for begin in range(0, count, size):
         end = min(begin + size, count)
         yield slice(begin, end), slice(first + begin, first + end)
-
-
-def _turned(matrix: Float[Tensor, "e k l"], x: Float[Tensor, "e k c"]) -> Float[Tensor, "e l c"]:
-    """`matrix^T x`; of one column summed along the rows, which takes half as long as small products turned around."""
-    return (matrix * x).sum(1)[..., None] if x.shape[-1] == 1 else matrix.mT @ x
 
 
 @dataclass(frozen=True)
@@ -200,7 +221,7 @@ class Products:
 
 _HELD = 1 << 22
 """Numbers of windows that may wait."""
-_LOT = 1 << 19
+_LOT = 1 << 16
 """Numbers of right-hand sides that are solved for at once."""
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.linearize import CHUNK_ROWS
-from crowdmap_torch.optim.solvers.block_elimination import Lead
+from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
@@ -56,7 +56,7 @@ class ChainBorder:
     """Blocks of B."""
     link: Float[Tensor, "e k b"]
     """Blocks of F."""
-    leads: Sequence[Sequence[Lead]]
+    leads: Sequence[Sequence[KeptLead]]
     """What the rounds of every part leave behind of A."""
 
     def add(self, system: TileMatrix, gradient: Float[Tensor, "e k"]) -> None:
@@ -69,7 +69,7 @@ class ChainBorder:
             return
         forgotten = pattern.at(*torch.full((2, 1), pattern.dim + 1, device=gradient.device))
 
-        def of_part(of: tuple[Part, Sequence[Lead]]) -> Through:
+        def of_part(of: tuple[Part, Sequence[KeptLead]]) -> Through:
             part, leads = of
             chain, column = torch.unique(structure.owner[part.block], return_inverse=True)
             beside = gradient[part.block][..., None]
@@ -89,7 +89,7 @@ class ChainBorder:
     def through(
         self,
         part: Part,
-        leads: Sequence[Lead],
+        leads: Sequence[KeptLead],
         right_side: Float[Tensor, "n k c"],
         beside: Float[Tensor, "n k d"],
         column: Int[Tensor, " n"],
@@ -190,7 +190,7 @@ def weighted_sums(
     full, own = torch.cat((leaves, weight)), weight.new_zeros(count, m, m)
     every = list(zip(structure.parts, chains.leads, strict=True))
 
-    def of_part(one: tuple[Part, Sequence[Lead]]) -> tuple[Through, Tensor]:
+    def of_part(one: tuple[Part, Sequence[KeptLead]]) -> tuple[Through, Tensor]:
         part, leads = one
         seen, column = torch.unique(of[structure.owner[part.block]], return_inverse=True)
         w = full[part.block]

@@ -32,6 +32,7 @@ from crowdmap_torch.optim.linearize import row_blocks
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, assemble
 from crowdmap_torch.optim.solvers.block_elimination import (
+    KeptLead,
     Lead,
     Products,
     eliminate,
@@ -209,7 +210,7 @@ class ChainNormalEquations:
             lambda: workspace.factor is factor,
         )
 
-    def chains(self, leads: Sequence[Sequence[Lead]]) -> ChainBorder:
+    def chains(self, leads: Sequence[Sequence[KeptLead]]) -> ChainBorder:
         """The chains, by what the rounds of every part leave behind, and what binds them to what stays."""
         return ChainBorder(self.structure, self.coupling, self.border_link, leads)
 
@@ -288,7 +289,7 @@ class ChainNormalEquations:
         added: Float[Tensor, "e k"],
         products: Products,
         store: Float[Tensor, "rows k"],
-    ) -> tuple[Lead, ...]:
+    ) -> tuple[KeptLead, ...]:
         """Takes a part's chains off the reduced system, round by round, and hands back what the rounds leave behind."""
         structure, system = self.structure, products.system
         store = self._filled(store[: part.store_rows + 1], part)
@@ -296,7 +297,7 @@ class ChainNormalEquations:
         leads = []
         for of_round in part.rounds:
             lead = lead_of(of_round, diagonal, link)
-            leads.append(lead)
+            leads.append(lead.kept())
             fill_chain(of_round, lead.square(), diagonal, link)
 
             def eliminated(batch: Batch, of_round: Round = of_round, lead: Lead = lead):
@@ -358,7 +359,7 @@ class ChainNormalEquations:
         for name, block in self.coupling.items():
             coupling = self.structure.couplings.factors[name]
             of_factor = y.index_select(0, coupling.column.flatten()).view(coupling.column.shape)
-            product = (of_factor[:, None] @ block)[:, 0]
+            product = torch.bmm(of_factor[:, None], block)[:, 0]
             add_at(total[:, : product.shape[1]], 0, coupling.block, product)
         return total
 

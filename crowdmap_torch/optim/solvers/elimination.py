@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
-from crowdmap_torch.optim.solvers.block_elimination import Lead
+from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.couplings import Couplings, couplings_of
 from crowdmap_torch.optim.solvers.dissection import dissected, incidence, near_each_other
 from crowdmap_torch.optim.solvers.layout import Layout, layout
@@ -95,11 +95,11 @@ class ChainStructure:
         return replace(self, couplings=couplings, parts=parts)
 
     def solve(
-        self, leads: Sequence[Sequence[Lead]], right_side: Float[Tensor, "e k c"]
+        self, leads: Sequence[Sequence[KeptLead]], right_side: Float[Tensor, "e k c"]
     ) -> Float[Tensor, "e k c"]:
         """A^-1 of right-hand sides, by what the rounds of every part leave behind."""
 
-        def of_part(of: tuple[Part, Sequence[Lead]]) -> Float[Tensor, "n k c"]:
+        def of_part(of: tuple[Part, Sequence[KeptLead]]) -> Float[Tensor, "n k c"]:
             part, own = of
             return part.solve(own, right_side[part.block])
 

@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.block_elimination import Lead
+from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
@@ -126,7 +126,7 @@ def joints_of(
     structure: ChainStructure,
     coupling: Mapping[str, Float[Tensor, "f w _"]],
     hessian: StayingBlocks,
-    leads: Sequence[Sequence[Lead]],
+    leads: Sequence[Sequence[KeptLead]],
 ) -> Joints | None:
     """Those of equations with B `coupling` and C `hessian`, by what rounds leave behind of A; None: there are none."""
     plan = structure.plan
@@ -140,7 +140,7 @@ def joints_of(
     chains = len(plan.joint)
 
     def of_part(
-        of: tuple[Part, Sequence[Lead]],
+        of: tuple[Part, Sequence[KeptLead]],
     ) -> tuple[Float[Tensor, "n k q"], Float[Tensor, "chains q q"]]:
         part, own = of
         E = _towards_joints(structure, part, coupling, width)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.block_elimination import Lead
+from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.joints import Joints, joints_of
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
@@ -36,7 +36,7 @@ class KnownLandmarks:
     structure: ChainStructure
     diagonal: Float[Tensor, "e k k"] = field(repr=False)
     link: Float[Tensor, "e k k"] = field(repr=False)
-    leads: tuple[tuple[Lead, ...], ...] = field(repr=False)
+    leads: tuple[tuple[KeptLead, ...], ...] = field(repr=False)
     """What the elimination of A alone leaves behind, by part and round."""
     joints: Joints | None = field(repr=False)
 
@@ -48,11 +48,11 @@ class KnownLandmarks:
         link: Float[Tensor, "e k k"],
         coupling: Mapping[str, Float[Tensor, "f w _"]],
         hessian: StayingBlocks,
-        leads: tuple[tuple[Lead, ...], ...] | None = None,
+        leads: tuple[tuple[KeptLead, ...], ...] | None = None,
     ) -> KnownLandmarks:
         """That of normal equations; `leads` where they are known already."""
 
-        def led(part: Part) -> tuple[Lead, ...]:
+        def led(part: Part) -> tuple[KeptLead, ...]:
             return part.leads(diagonal, link)
 
         if leads is None:
@@ -63,7 +63,7 @@ class KnownLandmarks:
     def of_blocks(self) -> Float[Tensor, "e k k"]:
         """Covariance of every eliminated block."""
 
-        def of_part(of: tuple[Part, Sequence[Lead]]) -> Float[Tensor, "n k k"]:
+        def of_part(of: tuple[Part, Sequence[KeptLead]]) -> Float[Tensor, "n k k"]:
             part, leads = of
             own = diagonal_of_inverse(part, leads)
             return own if self.joints is None else own + self.joints.of_blocks(part.block)
@@ -79,7 +79,7 @@ class KnownLandmarks:
     def _of_chains(self) -> Float[Tensor, "n k k"]:
         """The same of the chains' blocks, but for what joints add."""
 
-        def of_part(of: tuple[Part, Sequence[Lead]]) -> Float[Tensor, "m k k"]:
+        def of_part(of: tuple[Part, Sequence[KeptLead]]) -> Float[Tensor, "m k k"]:
             return diagonal_of_inverse(*of, leaves=False)
 
         leaves, parts = self.structure.plan.leaf_count, self.structure.parts
@@ -135,7 +135,7 @@ class KnownLandmarks:
             for here in _by_column(torch.nonzero(of_part == i)[:, 0], changes.column[row])
         ]
 
-        def solved(of_one: tuple[Part, Sequence[Lead], Tensor]) -> Float[Tensor, "r m"]:
+        def solved(of_one: tuple[Part, Sequence[KeptLead], Tensor]) -> Float[Tensor, "r m"]:
             part, leads, here = of_one
             sign = (2.0 * end[here] - 1)[:, None, None]
             at = number[here] - part.leaf_count

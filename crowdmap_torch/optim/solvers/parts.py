@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.block_elimination import Lead, leads_of, solve_rounds
+from crowdmap_torch.optim.solvers.block_elimination import KeptLead, leads_of, solve_rounds
 from crowdmap_torch.optim.solvers.couplings import Coupling
 from crowdmap_torch.optim.solvers.dissection import incidence
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
@@ -78,18 +78,18 @@ class Part:
 
     def leads(
         self, diagonal: Float[Tensor, "e k k"], link: Float[Tensor, "e k k"]
-    ) -> tuple[Lead, ...]:
+    ) -> tuple[KeptLead, ...]:
         """What all rounds leave behind of A alone."""
         return leads_of(self.rounds, *self.by_place(diagonal, link))
 
     def solve(
-        self, leads: Sequence[Lead], right_side: Float[Tensor, "n k c"]
+        self, leads: Sequence[KeptLead], right_side: Float[Tensor, "n k c"]
     ) -> Float[Tensor, "n k c"]:
         """A^-1 of right-hand sides of the part's blocks."""
         return self.solved(leads, right_side)[self.place]
 
     def solved(
-        self, leads: Sequence[Lead], right_side: Float[Tensor, "n k c"]
+        self, leads: Sequence[KeptLead], right_side: Float[Tensor, "n k c"]
     ) -> Float[Tensor, "places k c"]:
         """The same by place."""
         rest = right_side.new_zeros(len(self.at_place), *right_side.shape[1:])
@@ -97,7 +97,7 @@ class Part:
         return solve_rounds(self.rounds, leads, rest)
 
     def solve_chains(
-        self, leads: Sequence[Lead], right_side: Float[Tensor, "m k c"]
+        self, leads: Sequence[KeptLead], right_side: Float[Tensor, "m k c"]
     ) -> Float[Tensor, "m k c"]:
         """The same of its chains' blocks alone, the leaves marginalised."""
         # Leaves are the first round, if there are any.

@@ -16,12 +16,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.block_elimination import Lead
+from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.parts import Part
 
 
 def diagonal_of_inverse(
-    part: Part, leads: Sequence[Lead], *, leaves: bool = True
+    part: Part, leads: Sequence[KeptLead], *, leaves: bool = True
 ) -> Float[Tensor, "n k k"]:
     """Diagonal blocks of the inverse of A, those of a part, by what its rounds leave behind.
 
@@ -30,11 +30,12 @@ def diagonal_of_inverse(
     # Leaves are the first round, if there are any.
     begun = int(not leaves and part.leaf_count > 0)
     place = part.place[part.leaf_count if begun else 0 :]
-    k = leads[0].whiten.shape[-1]
+    k = len(leads[0].whiten)
     found = leads[0].whiten.new_zeros(len(part.at_place), k, k)
     # With the block that follows, of those known so far.
     crossed = torch.zeros_like(found)
-    for of_round, lead in zip(reversed(part.rounds[begun:]), reversed(leads[begun:]), strict=True):
+    for of_round, kept in zip(reversed(part.rounds[begun:]), reversed(leads[begun:]), strict=True):
+        lead = kept.blocks()
         inverse, towards = lead.whiten.mT @ lead.whiten, lead.whiten.mT @ lead.towards
         around = found[of_round.neighbour]
         if of_round.neighbour.shape[1] == 2:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.block_elimination import Lead
+from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
@@ -65,7 +65,7 @@ class Workspace:
 class Factor:
     """The factorised matrix."""
 
-    leads: tuple[tuple[Lead, ...], ...]
+    leads: tuple[tuple[KeptLead, ...], ...]
     """By part and round."""
     reduced: TiledCholesky | None
     """Of S; None where S is a part of a sum."""
