@@ -24,7 +24,7 @@ from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
-CHUNK_ROWS = 1 << 13
+CHUNK_ROWS = 1 << 14
 """Rows that are linearised at once on a CPU; bounds the memory, whatever the size of the problem."""
 
 

@@ -21,7 +21,7 @@ from typing import Generic, TypeVar
 import torch
 from threadpoolctl import ThreadpoolController
 
-_WORTH = 4
+_WORTH = 2
 """Items for each thread from which handing them over pays, where each is little work."""
 _AHEAD = 3
 """Results for each thread that may be held: whoever takes them has other things to do too."""

@@ -20,9 +20,10 @@ of C, and what it has in common with the chains is no part of B but F, `border_l
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -69,6 +70,7 @@ from crowdmap_torch.processes.threads import in_order
 
 _NEXT_TO_NOTHING = 1e-6
 """Share by which diagonals are raised up to which covariances are as good as those of what is not damped."""
+R = TypeVar("R")
 UNOBSERVED_FLOOR = 1e-9
 """Information added to every landmark before its covariance is read: none that nothing observes spoils the others."""
 
@@ -184,7 +186,7 @@ class ChainNormalEquations:
         """The step for another gradient, by the last factors."""
         where = self.structure.where
         a, b = self.structure.stack(gradient), where.pack(gradient)[0]
-        right_side = b - self.couple_all(self.solve_alone(a))
+        right_side = b - self.couple_all(a)
         y = -self.solve_reduced(right_side[:, None])[:, 0]
         in_sigmas = mean_in_sigmas(-(right_side @ y)[None], where.used.sum(1).to(y))
         return Correction(self.unpack(self.substitute(y, a), y), in_sigmas)
@@ -265,15 +267,12 @@ class ChainNormalEquations:
 
         The arguments are added to the diagonals of A and C.
         """
-        structure, system, store = self.structure, self.workspace.system(), self.workspace.store()
+        structure, system = self.structure, self.workspace.system()
         self.hessian.add_to(system)
         system.right_side.copy_(self.gradient)
         if added_y is not None:
             system.add_diagonal(added_y + structure.where.gaps)
-        products = Products(system)
-        leads = tuple(self._eliminate(part, added_x, products, store) for part in structure.parts)
-        del store
-        products.subtract()
+        leads = self._eliminate_all(added_x, system)
         self.chains(leads).add(system, self.eliminated_gradient)
         is_undamped = not bool(
             (added_x > _NEXT_TO_NOTHING * self.diagonal.diagonal(dim1=-2, dim2=-1)).any()
@@ -283,16 +282,30 @@ class ChainNormalEquations:
         self.workspace.factor = factor
         return system, factor
 
+    def _eliminate_all(
+        self, added: Float[Tensor, "e k"], system: TileMatrix
+    ) -> tuple[tuple[KeptLead, ...], ...]:
+        """Takes all chains off the reduced system, and hands back what the rounds of every part leave behind."""
+        parts, lanes = self.structure.parts, self.structure.lanes
+
+        def eliminated(lane: int) -> tuple[list[tuple[KeptLead, ...]], TileMatrix]:
+            own = TileMatrix.zeros(system.pattern, system.flat) if lane else system
+            return [self._eliminate(parts[i], added, own) for i in lanes[lane]], own
+
+        leads: dict[int, tuple[KeptLead, ...]] = {}
+        done = in_order(eliminated, range(len(lanes)), system.flat.device, worth=1)
+        for lane, (of_lane, own) in zip(lanes, done, strict=True):
+            leads |= zip(lane, of_lane, strict=True)
+            if own is not system:
+                system.flat.add_(own.flat)
+        return tuple(leads[i] for i in range(len(parts)))
+
     def _eliminate(
-        self,
-        part: Part,
-        added: Float[Tensor, "e k"],
-        products: Products,
-        store: Float[Tensor, "rows k"],
+        self, part: Part, added: Float[Tensor, "e k"], system: TileMatrix
     ) -> tuple[KeptLead, ...]:
         """Takes a part's chains off the reduced system, round by round, and hands back what the rounds leave behind."""
-        structure, system = self.structure, products.system
-        store = self._filled(store[: part.store_rows + 1], part)
+        structure, products = self.structure, Products(system)
+        store = self._filled(self.workspace.store(part.store_rows + 1), part)
         diagonal, link = part.by_place(self.diagonal, self.link, added)
         leads = []
         for of_round in part.rounds:
@@ -312,6 +325,7 @@ class ChainNormalEquations:
                     add_at(system.flat, 0, *found.scattered)
                 elif batch.products is not None:
                     products.add(batch.products, found.wide)
+        products.subtract()
         return tuple(leads)
 
     def _filled(self, store: Float[Tensor, "rows k"], part: Part) -> Float[Tensor, "rows k"]:
@@ -333,47 +347,55 @@ class ChainNormalEquations:
         assert factor is not None and factor.reduced is not None
         return factor.reduced.solve(right_side)
 
-    def solve_eliminated(self, right_side: Float[Tensor, "e k c"]) -> Float[Tensor, "e k c"]:
-        """A^-1 of right-hand sides, by the last factors.
-
-        Chains do not touch each other in A: one column serves as many right-hand sides as there are chains.
-        """
-        assert self.workspace.factor is not None
-        return self.structure.solve(self.workspace.factor.leads, right_side)
-
-    def couple_all(self, x: Float[Tensor, "e k"]) -> Float[Tensor, " r"]:
-        """What eliminated blocks are coupled to: B x, and F^T x of the border."""
+    def couple_all(self, gradient: Float[Tensor, "e k"]) -> Float[Tensor, " r"]:
+        """What eliminated blocks tell of what stays: B A^-1 a, and F^T A^-1 a of the border, by the last factors."""
         structure, total = self.structure, torch.zeros_like(self.gradient)
-        for name, block in self.coupling.items():
-            coupling = structure.couplings.factors[name]
-            product = block @ x.index_select(0, coupling.block)[:, : block.shape[2], None]
-            add_at(total, 0, coupling.column.flatten(), product.flatten())
+        x = torch.empty_like(gradient)
+
+        def told_by(part: Part, leads: Sequence[KeptLead]) -> Float[Tensor, " r"]:
+            x[part.block] = part.solve(leads, gradient[part.block][..., None])[..., 0]
+            told = torch.zeros_like(total)
+            for name, own in part.factors.items():
+                coupling, block = structure.couplings.factors[name], self.coupling[name][own]
+                of_block = x.index_select(0, coupling.block[own])[:, : block.shape[2], None]
+                add_at(told, 0, coupling.column[own].flatten(), (block @ of_block).flatten())
+            return told
+
+        for told in self._by_part(told_by):
+            total += told
         # A transposed F would be copied, which is as large as it gets.
         told = (x[:, None] @ self.border_link)[:, 0]
         by_chain = add_at(told.new_zeros(structure.border.shape), 0, structure.owner, told)
         return add_at(total, 0, structure.border.flatten(), by_chain.flatten())
-
-    def couple_back(self, y: Float[Tensor, " r"]) -> Float[Tensor, "e k"]:
-        """B^T y."""
-        total = torch.zeros_like(self.eliminated_gradient)
-        for name, block in self.coupling.items():
-            coupling = self.structure.couplings.factors[name]
-            of_factor = y.index_select(0, coupling.column.flatten()).view(coupling.column.shape)
-            product = torch.bmm(of_factor[:, None], block)[:, 0]
-            add_at(total[:, : product.shape[1]], 0, coupling.block, product)
-        return total
 
     def substitute(
         self, y: Float[Tensor, " r"], gradient: Float[Tensor, "e k"]
     ) -> Float[Tensor, "e k"]:
         """The steps of the eliminated blocks where what stays makes the step y, by the last factors."""
         of_border = y[self.structure.border][self.structure.owner]
-        linked = gradient + (self.border_link @ of_border[..., None])[..., 0]
-        return -self.solve_alone(linked + self.couple_back(y))
+        right_side = gradient + (self.border_link @ of_border[..., None])[..., 0]
 
-    def solve_alone(self, right_side: Float[Tensor, "e k"]) -> Float[Tensor, "e k"]:
-        """A^-1 of one right-hand side, by the last factors."""
-        return self.solve_eliminated(right_side[..., None])[..., 0]
+        def step_of(part: Part, leads: Sequence[KeptLead]) -> None:
+            # What is a part's own is no other's: all are in the same memory.
+            for name, own in part.factors.items():
+                coupling, block = self.structure.couplings.factors[name], self.coupling[name][own]
+                column, at = coupling.column[own], coupling.block[own]
+                of_factor = y.index_select(0, column.flatten()).view(column.shape)
+                product = torch.bmm(of_factor[:, None], block)[:, 0]
+                add_at(right_side[:, : block.shape[2]], 0, at, product)
+            solved = part.solve(leads, right_side[part.block][..., None])[..., 0]
+            right_side[part.block] = -solved
+
+        for _ in self._by_part(step_of):
+            pass
+        return right_side
+
+    def _by_part(self, function: Callable[[Part, Sequence[KeptLead]], R]) -> Iterator[R]:
+        """What comes of every part and of what its rounds have left behind, in order."""
+        factor = self.workspace.factor
+        assert factor is not None
+        every = list(zip(self.structure.parts, factor.leads, strict=True))
+        return in_order(lambda of: function(*of), every, self.gradient.device, worth=1)
 
 
 def border_information(

@@ -17,17 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
-from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.couplings import Couplings, couplings_of
 from crowdmap_torch.optim.solvers.dissection import dissected, incidence, near_each_other
 from crowdmap_torch.optim.solvers.layout import Layout, layout
-from crowdmap_torch.optim.solvers.parts import Part, PartBuilder, parts_of_chains
+from crowdmap_torch.optim.solvers.parts import Part, PartBuilder, in_pieces, parts_of_chains
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.sparse_tiles import TilePattern, tile_width
 from crowdmap_torch.optim.solvers.tile_patterns import (
@@ -40,10 +40,13 @@ from crowdmap_torch.optim.solvers.tile_patterns import (
 )
 from crowdmap_torch.optim.solvers.windows import LandmarkBlocks, WindowBuilder
 from crowdmap_torch.processes.amounts import at_once
-from crowdmap_torch.processes.threads import in_order
 
 _BATCH_BYTES = 1 << 22
 """Size of what is eliminated at once on a CPU: about what its cache holds."""
+_LITTLE = 1 << 22
+"""Numbers of a reduced system of which there may be two."""
+_FEW_ROWS = 1 << 21
+"""Rows of two stores that may be there at one time: 100 MB of blocks of six."""
 _SPARSER = 0.8
 """Share of the tiles of an order by dissection that a band is to have less than, if it is taken."""
 
@@ -78,10 +81,23 @@ class ChainStructure:
     seen_with: frozenset[str]
     """Variables of the border that rows of an eliminated block and landmarks touch as well."""
 
-    @property
-    def store_rows(self) -> int:
-        """Rows of the store: of the part that needs most."""
-        return max((part.store_rows for part in self.parts), default=0)
+    @cached_property
+    def lanes(self) -> tuple[tuple[int, ...], ...]:
+        """Parts that are eliminated one after the other, beside those of the other lane; each has a reduced system.
+
+        There is one lane on a GPU, and where another would take much memory. How many cores there are is of no account:
+        sums are taken in this order anywhere.
+        """
+        rows = [part.store_rows for part in self.parts]
+        every = tuple(range(len(rows)))
+        if len(every) < 2 or self.owner.device.type != "cpu" or self.reduced.size > _LITTLE:
+            return (every,)
+        lanes: tuple[list[int], list[int]] = ([], [])
+        for i in sorted(every, key=lambda i: -rows[i]):
+            min(lanes, key=lambda lane: sum(rows[j] for j in lane)).append(i)
+        if sum(max(rows[i] for i in lane) for lane in lanes) > _FEW_ROWS:
+            return (every,)
+        return tuple(tuple(sorted(lane)) for lane in lanes)
 
     @property
     def border_begin(self) -> int:
@@ -93,22 +109,6 @@ class ChainStructure:
         couplings = couplings.placed(self.landmarks)
         parts = _with_couplings(self.parts, couplings, self.plan, self.number)
         return replace(self, couplings=couplings, parts=parts)
-
-    def solve(
-        self, leads: Sequence[Sequence[KeptLead]], right_side: Float[Tensor, "e k c"]
-    ) -> Float[Tensor, "e k c"]:
-        """A^-1 of right-hand sides, by what the rounds of every part leave behind."""
-
-        def of_part(of: tuple[Part, Sequence[KeptLead]]) -> Float[Tensor, "n k c"]:
-            part, own = of
-            return part.solve(own, right_side[part.block])
-
-        solved = torch.empty_like(right_side)
-        every = list(zip(self.parts, leads, strict=True))
-        done = in_order(of_part, every, right_side.device, worth=1)
-        for part, found in zip(self.parts, done, strict=True):
-            solved[part.block] = found
-        return solved
 
     def stack(self, tangents: Mapping[str, Tensor]) -> Float[Tensor, "e k ..."]:
         """Tangents of the leaves and of the chains, one behind the other; narrower ones are padded with zeros."""
@@ -151,6 +151,7 @@ def analyse(
     Every row may touch one eliminated block and any landmarks; or one or two eliminated blocks, neighbours of a chain or a
     leaf and the block that carries it. Beside them it may touch the chain's blocks of the border.
     """
+    plan = in_pieces(plan)
     stays, landmarks, couplings, keys = _touched(problem, values, plan)
     if plan.room is not None:
         fits = bool(torch.isin(keys, plan.room, assume_unique=True).all())

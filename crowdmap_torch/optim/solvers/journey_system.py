@@ -243,7 +243,7 @@ class JourneyEquations:
             y = -self.summed.solve(right_side)
             return y, -(right_side @ y)[None]
 
-        y, along_last = self.together.met(stepped, own.couple_all(own.solve_alone(a)))
+        y, along_last = self.together.met(stepped, own.couple_all(a))
         in_sigmas = mean_in_sigmas(along_last, own.structure.where.used.sum(1).to(y))
         return Correction(own.unpack(own.substitute(y, a), y), in_sigmas)
 

@@ -30,6 +30,8 @@ _IN_COMMON = 0.5
 """Share of a chain's landmarks that it has in common with the first of a part, at least."""
 _LEAST_BLOCKS = 4096
 """Blocks of chains up to which parts are put together: small ones are all overhead."""
+_PIECE = 1 << 14
+"""Blocks that each piece of a part is to have, at least."""
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,24 @@ def parts_of_chains(
     if not last:
         return None
     return torch.from_numpy(part).to(keys.device)
+
+
+def in_pieces(plan: EliminationPlan) -> EliminationPlan:
+    """The plan with large parts cut into pieces, chain by chain, on a CPU: an even number, for two cores."""
+    owner = plan.owner
+    if owner.device.type != "cpu" or len(owner) < 2 * _PIECE:
+        return plan
+    blocks = torch.bincount(owner)
+    part = torch.zeros_like(blocks) if plan.part is None else plan.part
+    order = torch.argsort(part, stable=True)
+    count = add_at(torch.zeros_like(blocks), 0, part, blocks)
+    before = torch.empty_like(blocks)
+    before[order] = blocks[order].cumsum(0) - blocks[order]
+    before -= (count.cumsum(0) - count)[part]
+    pieces = (count // (2 * _PIECE) * 2).clamp_min(1)
+    number = (pieces.cumsum(0) - pieces)[part] + before * pieces[part] // count[part]
+    _, number = torch.unique(number, return_inverse=True)
+    return replace(plan, part=number)
 
 
 def _alone(rows: Mapping[str, Int[Tensor, " fw"]], size: int) -> frozenset[str]:

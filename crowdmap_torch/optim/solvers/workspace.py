@@ -19,8 +19,6 @@ class Workspace:
 
     reduced: TilePattern = field(repr=False)
     """That of the reduced system."""
-    rows: int
-    """Of the store."""
     is_kept: bool
     """Whether memory for the reduced system is taken once; of a part of a sum others need it meanwhile."""
     like: Float[Tensor, "0 k"] = field(repr=False)
@@ -34,7 +32,7 @@ class Workspace:
     @classmethod
     def of(cls, structure: ChainStructure, like: Float[Tensor, "0 k"]) -> Workspace:
         """That of an order of elimination, whatever rows are to be eliminated by it."""
-        return cls(structure.reduced, structure.store_rows + 1, structure.plan.is_whole, like)
+        return cls(structure.reduced, structure.plan.is_whole, like)
 
     def system(self) -> TileMatrix:
         """Zeros for the reduced system."""
@@ -46,13 +44,12 @@ class Workspace:
             self._kept = found
         return found
 
-    def store(self) -> Float[Tensor, "rows k"]:
+    def store(self, rows: int) -> Float[Tensor, "rows k"]:
         """Memory to eliminate in, whatever is in it: whoever does lets it go, others need it between two solves.
 
-        Per eliminated block and column of its window it has a row of `k`, by when it is eliminated; part after part in the
-        same.
+        Per eliminated block of a part and column of its window it has a row of `k`, by when it is eliminated.
         """
-        return self.like.new_empty(self.rows, self.like.shape[1])
+        return self.like.new_empty(rows, self.like.shape[1])
 
     def coupling(self, name: str, shape: tuple[int, ...]) -> Float[Tensor, "f w _"]:
         """Memory for a term's coupling; what is in it is of no account."""

@@ -246,8 +246,8 @@ def test_both_back_ends_reach_the_same_minimum():
 def test_what_is_eliminated_in_is_let_go(monkeypatch: pytest.MonkeyPatch):
     taken, take = [], Workspace.store
 
-    def store(workspace: Workspace) -> Tensor:
-        found = take(workspace)
+    def store(workspace: Workspace, rows: int) -> Tensor:
+        found = take(workspace, rows)
         taken.append(weakref.ref(found))
         return found
 
