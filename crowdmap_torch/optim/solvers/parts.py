@@ -4,8 +4,9 @@ Each chain's block may carry leaves, blocks of a second variable that are bound 
 other block of each chain is eliminated, all chains at once; those between are the chain of the next round, half as long,
 until no block is left (cyclic or nested reduction; Golub and Van Loan, Matrix Computations, 4.5.4).
 
-Chains that see other roads have little in common. They are eliminated one part after the other in the same memory, and each
-part leaves what it knows of its landmarks: the sum over parts is the reduced system.
+Chains that see other roads have little in common. They are eliminated one part after the other, so that memory is that of
+the largest part, and each leaves what it knows of its landmarks: the sum over parts is the reduced system. Large parts are
+cut into pieces, which two cores eliminate beside each other where that is little memory (`ChainStructure.lanes`).
 """
 
 from __future__ import annotations

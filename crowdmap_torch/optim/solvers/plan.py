@@ -44,8 +44,8 @@ class EliminationPlan:
     is_whole: bool = True
     """Whether these are all chains: then the reduced system is factored, else it is a part of a sum (`journey_system`)."""
     part: Int[Tensor, " chains"] | None = None
-    """Which of several parts each chain is of (`planned_ahead`): parts are eliminated one after the other, and those that
-    see other roads have little in common. None: all at once."""
+    """Which of several parts each chain is of (`planned_ahead`): parts are eliminated by themselves, and those that see
+    other roads have little in common. None: one part, unless it is large (`parts.in_pieces`)."""
 
     def __post_init__(self) -> None:
         """Refuses chains in pieces, and leaves that hang on nothing."""
