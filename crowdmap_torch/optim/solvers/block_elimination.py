@@ -28,10 +28,18 @@ from crowdmap_torch.processes.threads import in_order
 class Lead:
     """What the elimination of a round leaves to other blocks of its chains, block by block, while the round lasts."""
 
-    whiten: Float[Tensor, "e k k"]
-    """W, the inverse Cholesky factors of the diagonals."""
-    towards: Float[Tensor, "e k _"]
-    """V, minus these times the links to the neighbours."""
+    both: Float[Tensor, "e k _"]
+    """W and V, one beside the other."""
+
+    @property
+    def whiten(self) -> Float[Tensor, "e k k"]:
+        """W, the inverse Cholesky factors of the diagonals."""
+        return self.both[..., : self.both.shape[1]]
+
+    @property
+    def towards(self) -> Float[Tensor, "e k _"]:
+        """V, minus these times the links to the neighbours."""
+        return self.both[..., self.both.shape[1] :]
 
     def square(self) -> Float[Tensor, "e _ _"]:
         """To be added to the neighbours' diagonals and to the link between them."""
@@ -40,23 +48,29 @@ class Lead:
 
     def kept(self) -> KeptLead:
         """The same for later solves."""
-        both = torch.cat((self.whiten, self.towards), dim=-1).permute(1, 2, 0).contiguous()
-        k = len(both)
-        return KeptLead(both[:, :k], both[:, k:])
+        return KeptLead(self.both.permute(1, 2, 0).contiguous())
 
 
 @dataclass(frozen=True)
 class KeptLead:
     """What a round leaves behind for good, with the blocks as the last axis: solves take as long as reading it does."""
 
-    whiten: Float[Tensor, "k k e"]
-    """W."""
-    towards: Float[Tensor, "k _ e"]
-    """V."""
+    both: Float[Tensor, "k _ e"]
+    """W and V, one beside the other."""
+
+    @property
+    def whiten(self) -> Float[Tensor, "k k e"]:
+        """W."""
+        return self.both[:, : len(self.both)]
+
+    @property
+    def towards(self) -> Float[Tensor, "k _ e"]:
+        """V."""
+        return self.both[:, len(self.both) :]
 
     def blocks(self) -> Lead:
         """The same block by block."""
-        return Lead(*(x.permute(2, 0, 1).contiguous() for x in (self.whiten, self.towards)))
+        return Lead(self.both.permute(2, 0, 1).contiguous())
 
 
 def lead_of(
@@ -71,8 +85,7 @@ def lead_of(
     links = [eye, link[of_round.place]]
     if of_round.neighbour.shape[1] == 2:
         links.insert(1, link[of_round.neighbour[:, 0]].mT)
-    both = torch.linalg.solve_triangular(factor, torch.cat(links, dim=-1), upper=False).neg_()
-    return Lead(both[..., :k], both[..., k:])
+    return Lead(torch.linalg.solve_triangular(factor, torch.cat(links, dim=-1), upper=False).neg_())
 
 
 def fill_chain(
