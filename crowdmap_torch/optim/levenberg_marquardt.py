@@ -110,9 +110,12 @@ class LmState:
         return tuple(REASONS[code] for code in self.reason.tolist())
 
 
-def init(problem: Problem, values: Values, config: LmConfig) -> LmState:
-    """The state before the first step: the cost at `values`, nothing moved."""
-    term_cost = term_costs(problem, values)
+def init(
+    problem: Problem, values: Values, config: LmConfig, *, backend: Backend | None = None
+) -> LmState:
+    """The state before the first step: the cost at `values`, nothing moved; by a back end with its normal equations."""
+    normal = None if backend is None else backend.assemble(problem, values)
+    term_cost = term_costs(problem, values) if normal is None else normal.term_cost
     cost = torch.stack(list(term_cost.values())).sum(0)
     nothing = torch.zeros_like(cost)
     return LmState(
@@ -126,6 +129,8 @@ def init(problem: Problem, values: Values, config: LmConfig) -> LmState:
         stretch=torch.ones_like(cost),
         accepted=torch.zeros_like(cost, dtype=torch.bool),
         reason=torch.where(cost.isfinite(), RUNNING, NOT_FINITE),
+        normal=normal,
+        linearizations=0 if normal is None else 1,
     )
 
 
@@ -313,7 +318,8 @@ def solve(
     problem: Problem, values: Values, config: LmConfig, *, backend: Backend | None = None
 ) -> LmState:
     """The state at the end: every problem converged, stalled, or out of iterations."""
-    state = init(problem, values, config)
+    backend = backend or DenseBackend()
+    state = init(problem, values, config, backend=backend)
     while not state.done and state.iterations < config.max_iterations:
         state = step(problem, state, config, backend=backend)
     return state

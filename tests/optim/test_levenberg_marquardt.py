@@ -56,6 +56,25 @@ def test_a_batch_gives_what_each_problem_gives_alone():
         torch.testing.assert_close(result[0], together[i], rtol=0, atol=1e-9)
 
 
+def test_a_minimisation_is_linearised_once_at_each_point_and_begins_so():
+    problem, true = curves(1)
+    made: list[torch.Tensor] = []
+
+    class Counting(DenseBackend):
+        def assemble(self, problem, values):
+            made.append(values["x"])
+            return super().assemble(problem, values)
+
+    state = lm.solve(problem, {"x": true + 0.3}, lm.LmConfig(), backend=Counting())
+    assert state.iterations > 2
+    assert len(made) == state.linearizations == state.iterations
+    begun = lm.init(problem, {"x": true + 0.3}, lm.LmConfig(), backend=Counting())
+    without = lm.init(problem, {"x": true + 0.3}, lm.LmConfig())
+    assert begun.normal is not None and begun.linearizations == 1
+    torch.testing.assert_close(begun.cost, without.cost)
+    torch.testing.assert_close(dict(begun.term_cost), without.term_cost)
+
+
 def test_outliers_do_not_move_a_tukey_fit():
     problem, true = curves(100, outliers=True)
     state = lm.solve(problem, {"x": true + 0.02}, lm.LmConfig())
