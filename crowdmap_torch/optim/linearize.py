@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -26,6 +27,9 @@ from crowdmap_torch.processes.threads import in_order
 
 CHUNK_ROWS = 1 << 14
 """Rows that are linearised at once on a CPU; bounds the memory, whatever the size of the problem."""
+_MANY_ROWS = 1 << 15
+"""Rows of a problem from which a second core is worth handing pieces over to it."""
+R = TypeVar("R")
 
 
 def rows(term: CostTerm, index: slice | Tensor) -> CostTerm:
@@ -52,16 +56,56 @@ def chunks(term: CostTerm, size: int | None = None) -> Iterator[tuple[slice, Cos
 
     Rows that are joined stay in one piece, however many they are.
     """
+    for piece in _cuts(term, size):
+        yield piece, rows(term, piece)
+
+
+def _cuts(
+    term: CostTerm, size: int | None, order: Int[Tensor, " m"] | None = None
+) -> Iterator[slice]:
+    """Where the pieces of a term are, its rows in an `order` of their own."""
     size = size or at_once(CHUNK_ROWS, term.slots[0][1].device)
     joint = term.loss if is_joint(term.loss) else term.shared
+    if joint is not None and order is not None:
+        joint = joint.of_rows(order)
     start = 0
     while start < len(term):
         stop = min(start + size, len(term))
         if joint is not None:
             stop = joint.cut(start, stop)
-        piece = slice(start, stop)
-        yield piece, rows(term, piece)
+        yield slice(start, stop)
         start = stop
+
+
+def of_pieces(
+    problem: Problem,
+    function: Callable[[str, slice, CostTerm], R],
+    device: torch.device,
+    *,
+    orders: Mapping[str, Int[Tensor, " m"] | None] | None = None,
+    chunk_rows: int | None = None,
+) -> Iterator[tuple[str, R]]:
+    """`function` of all pieces of all terms, term by term, each handed its term's name, its rows there and itself.
+
+    The rows of terms that have `orders` are taken in those. Pieces of different terms are seen to side by side.
+    """
+    by_term = orders or {}
+    pieces = [
+        (name, at)
+        for name, term in problem.terms.items()
+        for at in _cuts(term, chunk_rows, by_term.get(name))
+    ]
+
+    def of_piece(piece: tuple[str, slice]) -> tuple[str, R]:
+        name, at = piece
+        order = by_term.get(name)
+        return name, function(
+            name, at, rows(problem.terms[name], at if order is None else order[at])
+        )
+
+    count = sum(map(len, problem.terms.values()))
+    worth = 1 if count >= _MANY_ROWS else len(pieces) + 1
+    return in_order(of_piece, pieces, device, worth=worth)
 
 
 def residuals(term: CostTerm, values: Values) -> Float[Tensor, "m d"]:
@@ -316,13 +360,13 @@ def term_costs(
 ) -> dict[str, Float[Tensor, " groups"]]:
     """`1/2 sum rho` of every term, for each of the independent problems; of terms that others have as well."""
     first = next(iter(values.values()))
-    costs = {}
-    for name, term in problem.terms.items():
-        pieces = [piece for _, piece in chunks(term, chunk_rows)]
-        losses = in_order(lambda piece: _losses(problem, piece, values), pieces, first.device)
-        total = torch.stack([first.new_zeros(problem.group_count), *losses]).sum(0)
-        costs[name] = total
-    return problem.together.sum(costs)
+    losses = {name: [first.new_zeros(problem.group_count)] for name in problem.terms}
+    for name, loss in of_pieces(
+        *(problem, lambda _, __, piece: _losses(problem, piece, values), first.device),
+        chunk_rows=chunk_rows,
+    ):
+        losses[name].append(loss)
+    return problem.together.sum({name: torch.stack(of).sum(0) for name, of in losses.items()})
 
 
 def _losses(problem: Problem, piece: CostTerm, values: Values) -> Float[Tensor, " groups"]:

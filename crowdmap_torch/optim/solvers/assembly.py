@@ -17,10 +17,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import RowBlocks, chunks, row_gradients, rows
+from crowdmap_torch.optim.linearize import RowBlocks, of_pieces, row_gradients
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
 from crowdmap_torch.processes.sums import add_at, lasting
-from crowdmap_torch.processes.threads import in_order
 
 _Linearize = Callable[[CostTerm, Mapping[str, Variable], Values], RowBlocks]
 
@@ -88,28 +87,24 @@ def assemble(
     Those of a term that has `groups` are handed over in their order, and added up by group.
     """
     like = next(iter(values.values()))
-    by_term = {}
-    for name, term in problem.terms.items():
-        cost = like.new_zeros(problem.group_count)
-        own = (groups or {}).get(name, RowGroups())
-        ordered = term if own.order is None else rows(term, own.order)
+    by_term = {name: like.new_zeros(problem.group_count) for name in problem.terms}
+    group_of = {name: (groups or {}).get(name, RowGroups()) for name in problem.terms}
 
-        def linearised(
-            chunk: tuple[slice, CostTerm], name: str = name, own: RowGroups = own
-        ) -> tuple[CostTerm, Tensor, TermRows]:
-            at, piece = chunk
-            blocks = linearize(piece, problem.variables, values)
-            return piece, blocks.rho, own.added_up(TermRows(name, at, piece.slots, blocks))
+    def linearised(name: str, at: slice, piece: CostTerm) -> tuple[CostTerm, Tensor, TermRows]:
+        blocks = linearize(piece, problem.variables, values)
+        own = TermRows(name, at, piece.slots, blocks)
+        return piece, blocks.rho, group_of[name].added_up(own)
 
-        pieces = list(chunks(ordered, chunk_rows))
-        for piece, rho, chunk in in_order(linearised, pieces, like.device):
-            group = problem.group_of_rows(piece)
-            if group is None:
-                cost += rho.sum() / 2
-            else:
-                add_at(cost, 0, group, rho / 2)
-            add(chunk)
-        by_term[name] = cost
+    orders = {name: of.order for name, of in group_of.items()}
+    for name, (piece, rho, chunk) in of_pieces(
+        problem, linearised, like.device, orders=orders, chunk_rows=chunk_rows
+    ):
+        group = problem.group_of_rows(piece)
+        if group is None:
+            by_term[name] += rho.sum() / 2
+        else:
+            add_at(by_term[name], 0, group, rho / 2)
+        add(chunk)
     return Costs(torch.stack(list(by_term.values())).sum(0), by_term)
 
 

@@ -318,7 +318,7 @@ class ChainNormalEquations:
                 own = lead.whiten[here], lead.towards[here]
                 return eliminate(batch, *own, store, structure.reduced)
 
-            done = in_order(eliminated, of_round.batches, store.device)
+            done = in_order(eliminated, of_round.batches, store.device, worth=1)
             for batch, found in zip(of_round.batches, done, strict=True):
                 add_at(store, 0, batch.fill.flatten().long(), found.fill)
                 if found.scattered is not None:

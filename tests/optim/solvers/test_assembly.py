@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from worlds.bordered_chains import drives
 
+from crowdmap_torch.optim import linearize
 from crowdmap_torch.optim.linearize import row_blocks, term_costs
+from crowdmap_torch.optim.robust import JointTukey
 from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, RowGroups, TermRows, assemble
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 
@@ -37,6 +41,47 @@ def test_rows_come_in_chunks_and_in_the_order_asked_for():
     for slot, (_, block) in enumerate(problem.terms["sighting"].slots):
         found = torch.cat([chunk.slots[slot][1] for chunk in mine])
         assert torch.equal(found, block[order])
+
+
+def test_pieces_of_all_terms_are_handed_over_in_order_on_any_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    problem, values, _ = drives()
+    monkeypatch.setattr(linearize, "_MANY_ROWS", 1)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            chunks: list[TermRows] = []
+            costs = assemble(problem, values, row_blocks, chunks.append, chunk_rows=20)
+            found.append((costs, chunks))
+    finally:
+        torch.set_num_threads(before)
+    (alone, chunks), *others = found
+    every = [(name, i) for name, term in problem.terms.items() for i in range(0, len(term), 20)]
+    assert [(chunk.term, chunk.at.start) for chunk in chunks] == every
+    for costs, own in others:
+        assert torch.equal(costs.total, alone.total)
+        assert [(chunk.term, chunk.at) for chunk in own] == [(c.term, c.at) for c in chunks]
+        for a, b in zip(own, chunks, strict=True):
+            assert all(map(torch.equal, a.blocks.gradient, b.blocks.gradient))
+
+
+def test_rows_that_are_joined_stay_together_in_an_order_of_their_own():
+    problem, values, _ = drives()
+    term = problem.terms["sighting"]
+    together, bound = torch.arange(len(term)) // 4, torch.tensor(4.0).double()
+    joined = replace(term, loss=JointTukey.by_efficiency(together, bound, row_dim=2))
+    order = torch.arange(len(term)).view(-1, 4).flip(0).flatten()
+    chunks: list[TermRows] = []
+    assemble(
+        replace(problem, terms={"sighting": joined}),
+        *(values, row_blocks, chunks.append),
+        groups={"sighting": RowGroups(order)},
+        chunk_rows=10,
+    )
+    assert len(chunks) > 2
+    assert all(chunk.at.stop % 4 == 0 for chunk in chunks)
 
 
 def test_diagonal_blocks_are_those_of_the_dense_matrix():
