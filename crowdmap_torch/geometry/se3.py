@@ -70,12 +70,12 @@ def right_jacobian_inverse(w: Float[Tensor, "3 *#rows"]) -> Float[Tensor, "3 3 *
     theta_sq = w.square().sum(0)
     # Bernoulli numbers' series below a tenth of a radian, where the next term is below 1e-13.
     small = theta_sq < 0.01
-    theta = torch.where(small, torch.ones_like(theta_sq), theta_sq).sqrt()
-    factor = torch.where(
-        small,
-        1 / 12 + theta_sq * (1 / 720 + theta_sq * (1 / 30240 + theta_sq / 1209600)),
-        (1 - theta * (1 + theta.cos()) / (2 * theta.sin())) / theta.square(),
-    )
+    factor = 1 / 12 + theta_sq * (1 / 720 + theta_sq * (1 / 30240 + theta_sq / 1209600))
+    # Errors of poses are small: nearly always that is all.
+    if not bool(small.all()):
+        theta = torch.where(small, torch.ones_like(theta_sq), theta_sq).sqrt()
+        closed = (1 - theta * (1 + theta.cos()) / (2 * theta.sin())) / theta.square()
+        factor = torch.where(small, factor, closed)
     # I + W / 2 + factor W W, where W W = w w^T - |w|^2 I.
     a = 4 * factor
     xx, yy, zz = a * x * x, a * y * y, a * z * z

@@ -352,7 +352,10 @@ def _rows_last(x: Float[Tensor, "m ..."]) -> Float[Tensor, "... m"]:
 
 def _scale(weight: Float[Tensor, " m"] | Float[Tensor, "m d"]) -> Float[Tensor, "#d m"]:
     """Weights as factors of residuals, the rows as the last axis."""
-    return weight.mT.contiguous() if weight.ndim == 2 else weight[None]
+    if weight.ndim == 1:
+        return weight[None]
+    # What is the same for all rows is one number in memory.
+    return weight.mT if weight.stride(0) == 0 else weight.mT.contiguous()
 
 
 def term_costs(

@@ -79,6 +79,14 @@ def test_right_jacobian_inverse_is_the_derivative_of_the_logarithm(angle, genera
     torch.testing.assert_close(se3.right_jacobian_inverse(w), expected, rtol=0, atol=1e-11)
 
 
+def test_right_jacobian_inverse_of_large_and_small_angles_together_is_that_of_each(generator):
+    w = random_tangents(generator, 6, 1.0)[:, 3:]
+    w = torch.nn.functional.normalize(w) * torch.tensor([0.0, 0.05, 0.09, 0.2, 1.0, 3.0])[:, None]
+    together = se3.right_jacobian_inverse(w.mT)
+    for each, column in zip(w, together.unbind(-1), strict=True):
+        torch.testing.assert_close(se3.right_jacobian_inverse(each), column, rtol=1e-15, atol=0)
+
+
 def test_inverse_undoes(generator):
     T = se3.exp(random_tangents(generator, 100, 3.0))
     identity = torch.eye(4, dtype=torch.float64).expand_as(T)

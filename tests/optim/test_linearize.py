@@ -155,6 +155,16 @@ def test_costs_add_up_by_group(term: CostTerm, values: Values):
         assert torch.allclose(costs["t"], expected, atol=1e-14)
 
 
+def test_weights_that_all_rows_share_need_no_memory_of_their_own(term: CostTerm, values: Values):
+    one = torch.tensor([2.0, 0.5, 3.0], dtype=torch.float64)
+    shared = replace(term, weight=one.expand(len(term), 3))
+    own = replace(term, weight=one.repeat(len(term), 1))
+    some, others = (linearize.row_blocks(t, VARIABLES, values) for t in (shared, own))
+    assert torch.equal(some.rho, others.rho)
+    assert all(map(torch.equal, some.gradient, others.gradient))
+    assert all(torch.equal(some.hessian[key], others.hessian[key]) for key in others.hessian)
+
+
 def test_a_term_without_rows_has_no_residuals(term: CostTerm, values: Values):
     none = linearize.rows(term, slice(0, 0))
     assert linearize.residuals(none, values).numel() == 0

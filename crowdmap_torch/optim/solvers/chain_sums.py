@@ -81,12 +81,15 @@ class ChainSums:
         if plan.carrier is not None:
             of_leaf = (low < leaves) & (high >= leaves)
             linked[of_leaf] = plan.carrier[low[of_leaf]] == high[of_leaf] - leaves
-        if not bool(linked.all()):
+        is_linked, in_order = torch.stack((linked.all(), (here < there).all())).tolist()
+        if not is_linked:
             raise ValueError(
                 "a term links two eliminated blocks that are neither neighbours in their chain "
                 "nor a leaf and the block that carries it"
             )
-        add_at(self.link, 0, low, torch.where((here < there)[:, None, None], block, block.mT))
+        if not in_order:
+            block = torch.where((here < there)[:, None, None], block, block.mT)
+        add_at(self.link, 0, low, block)
 
 
 class ReducibleSums(ChainSums):

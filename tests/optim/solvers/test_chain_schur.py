@@ -16,6 +16,7 @@ from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.linearize import rows
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
 from crowdmap_torch.optim.robust import Tukey
+from crowdmap_torch.optim.solvers import chain_schur
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
@@ -273,6 +274,13 @@ def test_the_step_does_not_depend_on_the_order_of_rows():
     )
     for name in values:
         torch.testing.assert_close(first.delta[name], second.delta[name], rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("width", [1, 3, 4, 5])
+def test_rows_times_their_blocks(width: int):
+    rows, blocks = torch.randn(20, width).double(), torch.randn(20, width, 6).double()
+    expected = torch.einsum("fw,fwk->fk", rows, blocks)
+    torch.testing.assert_close(chain_schur._rows_times(rows, blocks), expected)
 
 
 def test_links_between_distant_blocks_are_refused():
