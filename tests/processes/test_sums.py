@@ -80,6 +80,7 @@ def test_an_index_that_lasts_is_sorted_once(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_what_was_sorted_goes_with_its_index():
+    gc.collect()  # What other tests left in circles.
     before = len(sums._kept)
     index = indices(30, 4)
     add_at(torch.zeros(4, dtype=torch.float64), 0, index, drawn(30))
