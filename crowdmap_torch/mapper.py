@@ -21,8 +21,9 @@ from crowdmap_torch.adjustment.detection_lanes import with_lanes
 from crowdmap_torch.adjustment.footing import Footing, footing_of
 from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
-from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_lanes
+from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_pieces
 from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
+from crowdmap_torch.crowd_lanes.tie_groups import GroupTies, tie_groups
 from crowdmap_torch.crowd_signs.complete_tracks import (
     AssociatedSigns,
     CompletedTracks,
@@ -33,13 +34,13 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
 )
 from crowdmap_torch.crowd_signs.duplicates import may_be_one
 from crowdmap_torch.crowd_signs.gather import gather_signs
-from crowdmap_torch.crowd_signs.journey_bias import unbiased_poses
+from crowdmap_torch.crowd_signs.groups import groups_of
+from crowdmap_torch.crowd_signs.journey_bias import without_bias
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.fleet.here import InProcess
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.maps import as_map
 from crowdmap_torch.io.stored_drives import StoredDrive
 from crowdmap_torch.lanes.reconstruct import LaneReport, reconstruct_lanes
@@ -109,6 +110,8 @@ class FirstMap:
     """Per journey the tangents from the given poses to those without bias."""
     completed: CompletedTracks | None
     """What clustering had set aside and was brought back; None with `paper2017`, which does not."""
+    ties: GroupTies | None = None
+    """How drives that no sign ties to others were placed by lanes; None with `paper2017`, which does not."""
     anew: int = 0
     """How often it was made anew of an adjusted map."""
     joined: int = 0
@@ -246,36 +249,30 @@ def first_map(
     """Section V-A: landmarks of many journeys in clusters, the journeys' biases, and the cluster heads."""
     config = config.resolved()
     tracklets = [m.sign_tracklets for m in maps]
-    gathered = gather_signs(
-        journeys,
-        tracklets,
-        concatenate([m.signs for m in maps]),
-        bias_sigma_m=config.positioning.bias_sigma_m,
-    )
+    signs, sigma = concatenate([m.signs for m in maps]), config.positioning.bias_sigma_m
+    gathered = gather_signs(journeys, tracklets, signs, bias_sigma_m=sigma)
     generator = torch.Generator().manual_seed(config.seed)
     crowd = register_crowd(gathered, config.positioning, config.crowd, generator=generator)
-    given = [journey.T_world_camera for journey in journeys]
-    poses = [unbiased_poses(T, crowd.bias, number, station(T)) for number, T in enumerate(given)]
-    drifts = tuple(se3.local(T, start) for T, start in zip(given, poses, strict=True))
+    given, made = [journey.T_world_camera for journey in journeys], [m.lanes for m in maps]
+    poses, drifts = without_bias(given, crowd.bias)
+    ties = None
+    if config.crowd.method != "paper2017":
+        pieces = unbiased_pieces(made, drifts, trusted := crowd.trusted_frames(journeys))
+        known = groups_of(crowd), gathered.bias_sigma, crowd.positioning
+        ties = tie_groups(pieces, poses, *known, config.lane_join.tie_groups)
+        crowd = crowd.moved(ties.move)
+        poses, drifts = without_bias(given, crowd.bias)
+        pieces = unbiased_pieces(made, drifts, trusted)
+        joined = join_lanes(pieces, crowd.positioning, config.lane_join)
+        lanes, support, rounds = joined.lanes, joined.support, ()
+    else:
+        pieces = concatenate_lanes(made)
+        clusters = cluster_lanes(pieces, config.lane_cluster, generator=generator)
+        lanes, rounds = clusters.heads, clusters.rounds
+        support = support_of_pieces(pieces, clusters.label, config.lane_join.sample_spacing_m)
     found = associate_detections(
         journeys, poses, tracklets, crowd, config.crowd, config.complete_tracks
     )
-    made = [m.lanes for m in maps]
-    if config.crowd.method == "paper2017":
-        pieces = concatenate_lanes(made)
-        clusters = cluster_lanes(pieces, config.lane_cluster, generator=generator)
-        lanes = clusters.heads
-        support = support_of_pieces(pieces, clusters.label, config.lane_join.sample_spacing_m)
-        rounds = clusters.rounds
-    else:
-        # Bad drives leave nothing behind: where they are off is not known well enough to move their pieces.
-        trusted = crowd.trusted_frames(journeys)
-        moved = [
-            unbiased_lanes(pieces.select(torch.nonzero(is_good[pieces.frame])[:, 0]), drift)
-            for pieces, drift, is_good in zip(made, drifts, trusted, strict=True)
-        ]
-        joined = join_lanes(concatenate_lanes(moved), crowd.positioning, config.lane_join)
-        lanes, support, rounds = joined.lanes, joined.support, ()
     return FirstMap(
         signs=found.heads,
         lanes=lanes,
@@ -286,6 +283,7 @@ def first_map(
         associations=found.associations,
         drifts=drifts,
         completed=found.completed,
+        ties=ties,
     )
 
 

@@ -248,7 +248,7 @@ def _map(
             compared = _compared(result, config, given, folder)
         progress.finish()
         missing = _told(missing_findings(dataset, result, config), dataset)
-        strained = *unsettled_findings(first), *rotation_findings(dataset, result)
+        strained = *unsettled_findings(dataset, first), *rotation_findings(dataset, result)
         warnings = (*findings, *_told(strained, dataset), *missing)
         spent = progress, where.engine.spent_on()
         metrics = metrics_of(dataset, result, config, watch.iterations, *spent, *compared)

@@ -7,11 +7,12 @@ common curves are taken off before the ridges are traced a second time, sharper.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_mode, group_sum
@@ -40,6 +41,7 @@ from crowdmap_torch.crowd_lanes.splines import (
     select_curves,
 )
 from crowdmap_torch.crowd_lanes.table import LaneSupport, lanes_table
+from crowdmap_torch.crowd_lanes.tie_groups import GroupTieConfig
 from crowdmap_torch.crowd_lanes.trace import (
     TraceConfig,
     Traced,
@@ -51,7 +53,7 @@ from crowdmap_torch.crowd_lanes.trace import (
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.ranges import FILLED, Factor, Length, Settings, Share, Sigma, Spacing, Span
-from crowdmap_torch.tables import LANE_TYPES, Lanes
+from crowdmap_torch.tables import LANE_TYPES, Lanes, concatenate_lanes
 
 _RING_GAP = 1.0
 """A long curve whose ends are nearer to each other than this is a ring [m]."""
@@ -85,6 +87,8 @@ class LaneJoinConfig(Settings):
     """What makes a marker."""
     lateral_offset: LateralOffsetConfig = field(default_factory=LateralOffsetConfig)
     """How journeys' offsets may change."""
+    tie_groups: GroupTieConfig = field(default_factory=GroupTieConfig)
+    """How drives that no sign ties to others are placed first."""
 
     def __post_init__(self) -> None:
         """Refuses rounds without a gate."""
@@ -190,6 +194,24 @@ def unbiased_lanes(lanes: Lanes, drift: Float[Tensor, "f 6"]) -> Lanes:
     shift = drift[lanes.frame, :3]
     point = lanes.control.point_world + shift[lanes.piece_of_control]
     return replace(lanes, control=replace(lanes.control, point_world=point))
+
+
+def unbiased_pieces(
+    made: Sequence[Lanes],
+    drifts: Sequence[Float[Tensor, "_ 6"]],
+    trusted: Sequence[Bool[Tensor, " _"]],
+) -> Lanes:
+    """The pieces of all journeys, moved as their poses are, of the frames that are trusted.
+
+    Bad drives leave nothing behind: where they are off is not known well enough to move their pieces.
+    """
+    every = zip(made, drifts, trusted, strict=True)
+    return concatenate_lanes(
+        [
+            unbiased_lanes(pieces.select(torch.nonzero(is_good[pieces.frame])[:, 0]), drift)
+            for pieces, drift, is_good in every
+        ]
+    )
 
 
 def _trace_round(

@@ -118,7 +118,7 @@ def align_journeys(
         information = information * sure[:, None, None]
     # A journey without weight has no say in the places of the clusters, yet its own bias is found from them.
     say = weight[members.journey].clamp_min(1e-6)[:, None, None]
-    component = _connected_journeys(members.journey, label, journeys)
+    component = connected_journeys(members.journey, label, journeys)
     clusters = int(label.max()) + 1 if len(label) else 0
 
     bias = start
@@ -199,7 +199,7 @@ def in_shared_clusters(journey: Int[Tensor, " n"], label: Int[Tensor, " n"]) -> 
     return used & (number[label.clamp_min(0)] >= 2)
 
 
-def _connected_journeys(
+def connected_journeys(
     journey: Int[Tensor, " n"], label: Int[Tensor, " n"], journeys: int
 ) -> Int[Tensor, " j"]:
     """Component of each journey in the graph that joins journeys with the clusters they are in."""

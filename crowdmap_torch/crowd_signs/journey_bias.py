@@ -6,6 +6,7 @@ and heading of each remain.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.bias_wander import LEAST_SHARE, WANDER_SHARE
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.band_cholesky import BandFactor, cholesky_banded
@@ -109,6 +111,14 @@ def unbiased_poses(
     return se3.make(
         turn @ T_world_camera[:, :3, :3], position - bias_at(bias, rows, station, position)
     )
+
+
+def without_bias(
+    given: Sequence[Float[Tensor, "_ 4 4"]], bias: JourneyBias
+) -> tuple[list[Float[Tensor, "_ 4 4"]], tuple[Float[Tensor, "_ 6"], ...]]:
+    """The `unbiased_poses` of all journeys, and the tangents that lead to them from those given."""
+    poses = [unbiased_poses(T, bias, number, station(T)) for number, T in enumerate(given)]
+    return poses, tuple(se3.local(T, start) for T, start in zip(given, poses, strict=True))
 
 
 @dataclass(frozen=True)

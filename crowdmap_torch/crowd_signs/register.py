@@ -161,6 +161,18 @@ class Crowd:
     """1; 0 for bad drives, which had no say in the heads and biases of others."""
     report: CrowdReport
 
+    def moved(self, move: Float[Tensor, "j 3"]) -> Crowd:
+        """All that each journey saw moved by its row [m], the same for journeys that signs tie together."""
+        used, head = self.label >= 0, self.label.new_zeros(len(self.heads))
+        journey = head.scatter(0, self.label[used], self.members.journey[used])
+        return replace(
+            self,
+            members=moved(self.members, move[self.members.journey]),
+            heads=moved(self.heads, move[journey]),
+            tentative=moved(self.tentative, move[self.tentative.journey]),
+            bias=replace(self.bias, translation=self.bias.translation - move),
+        )
+
     def trusted_frames(self, journeys: Sequence[Journey]) -> tuple[Bool[Tensor, " _"], ...]:
         """By journey the frames that have a say: all but those of bad drives, and of outages of positioning."""
         return tuple(

@@ -1,0 +1,344 @@
+"""Drives that no sign ties to others, placed by the lane markers that both have seen (V-A.2, V-B).
+
+Whoever drives the other way sees other signs. The biases of two such groups of drives are known among themselves alone,
+and between them a metre or more may be left, which is another marker's place. One marker cannot tell; the whole pattern of
+a road's markers can, and where roads turn it tells both axes. A sample of one group, moved by a shift, speaks against it
+where the other drives would have seen it and saw no parallel marker there; what lies farther beside their ways than they
+see says nothing, as whoever drives the other way may see one marker of three. Along a straight road every shift is as
+likely, and the prior decides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from crowdmap_torch.clustering.neighbours import cross_pairs, pairs_between
+from crowdmap_torch.crowd_lanes.line_samples import (
+    MAX_ANGLE_COS,
+    LineSamples,
+    along_axis,
+    left_of_axis,
+)
+from crowdmap_torch.crowd_lanes.samples import sample_lanes
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.optim.robust import median_along
+from crowdmap_torch.processes.sums import running_sum
+from crowdmap_torch.ranges import Count, Deviations, Factor, Length, Settings, Share, Spacing
+from crowdmap_torch.tables import Lanes
+
+
+@dataclass(frozen=True)
+class GroupTieConfig(Settings):
+    """How groups of drives that no sign ties are placed beside each other."""
+
+    sample_spacing_m: Spacing = 4.0
+    """Pieces are sampled this densely."""
+    few_observations: Factor = 10.0
+    """Pieces made from fewer detections (or a quarter of the usual number, if that is less) are hardly believed."""
+    most_samples: Count = 400
+    """Most samples of a group that are looked at."""
+    noise_m: Length = 0.3
+    """1-sigma of what a marker's places in two groups are apart, their shift and the drift of both taken off."""
+    missed: Share = 0.1
+    """Likelihood of a sample that no marker of the other group is near, relative to one that is met."""
+    alike_m: Length = 150.0
+    """Way of marker that errs alike, as drift does: its samples together count as one."""
+    reach: Deviations = 4.0
+    """Shifts up to this many of their standard deviations are tried along each axis, or ..."""
+    reach_m: Length = 4.0
+    """... up to this, if that is more: how large biases are is known by few drives."""
+    step_m: Spacing = 0.25
+    """Between shifts that are tried."""
+    least_m: Length = 0.5
+    """Smaller shifts are left to the adjustment, which finds the way by itself."""
+    surer: Factor = 3.0
+    """A shift counts that is likelier than none by more than this in the logarithm."""
+    rival_m: Length = 1.0
+    """Another one this far away that is as likely, but for `surer`, leaves it open which is right."""
+
+
+@dataclass(frozen=True)
+class GroupTies:
+    """How groups of drives lie beside each other."""
+
+    move: Float[Tensor, "j 3"]
+    """By journey, what is to be added to its places [m]; weighted by what is known of biases, it is zero in the mean."""
+    group: Int[Tensor, " j"]
+    """The group of each journey."""
+    rival: Float[Tensor, "g 3"]
+    """By group another shift that the lanes fit about as well [m]; zero where there is none."""
+
+    @property
+    def open_groups(self) -> list[int]:
+        """Groups of which the lanes do not tell how they lie beside the others."""
+        return torch.nonzero(self.rival.abs().sum(1) > 0)[:, 0].tolist()
+
+
+def tie_groups(
+    lanes: Lanes,
+    ways: Sequence[Float[Tensor, "_ 4 4"]],
+    group: Int[Tensor, " j"],
+    bias_sigma: Float[Tensor, "j 3"],
+    positioning: PositioningNoise,
+    config: GroupTieConfig,
+) -> GroupTies:
+    """How far groups of drives are to be moved for their lane markers to be one pattern.
+
+    `group` says of each journey which others its signs tie it to, `bias_sigma` [m] how uncertain its bias was at first.
+    The pieces and the poses, `ways`, have what is known of the biases taken off. The largest group comes first, then group
+    by group that has lanes beside those that are placed already.
+    """
+    groups = int(group.max()) + 1 if len(group) else 0
+    move = bias_sigma.new_zeros(len(group), 3)
+    ties = GroupTies(move, group, bias_sigma.new_zeros(groups, 3))
+    if groups < 2 or not len(lanes):
+        return ties
+    samples = sample_lanes(
+        *(lanes, config.sample_spacing_m, positioning), few_observations=config.few_observations
+    ).line
+    samples = samples[samples.is_witness]
+    noise = math.hypot(config.noise_m, math.sqrt(2) * positioning.drift_sigma_m)
+    drifting = replace(config, noise_m=noise)
+    of_sample = group[samples.owner]
+    size = torch.bincount(of_sample, minlength=groups)
+    first, *left = torch.argsort(size, descending=True, stable=True).tolist()
+    placed, found = group == first, True
+    while left and found:
+        found = False
+        for one in list(left):
+            own = group == one
+            moved = replace(samples, point=samples.point + move[samples.owner])
+            others = _Seen.of(moved[placed[samples.owner]], ways, move, placed, config)
+            of_one = _Seen.of(moved[of_sample == one], ways, move, own, config)
+            of_own, of_placed = (_variance_of_mean(bias_sigma, some) for some in (own, placed))
+            sigma = (of_own + of_placed).sqrt()
+            best = _best_shift(of_one, others, sigma, drifting)
+            if best is None:
+                continue
+            shift, ties.rival[one] = best
+            share = of_placed / (of_own + of_placed)
+            move[own] += (1 - share) * shift
+            move[placed] -= share * shift
+            placed, found = placed | own, True
+            left.remove(one)
+    return ties
+
+
+def _variance_of_mean(
+    bias_sigma: Float[Tensor, "j 3"], some: Bool[Tensor, " j"]
+) -> Float[Tensor, " 3"]:
+    """Of the weighted mean of some drives' biases [m^2]."""
+    return 1 / bias_sigma[some].square().reciprocal().sum(0)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What some drives saw, and how far beside their ways."""
+
+    line: LineSamples
+    way: Float[Tensor, "w 2"]
+    """Places on their ways."""
+    beside: float
+    """Nearly all that they saw is at most so far beside these [m]."""
+
+    @classmethod
+    def of(
+        cls,
+        line: LineSamples,
+        ways: Sequence[Float[Tensor, "_ 4 4"]],
+        move: Float[Tensor, "j 3"],
+        some: Bool[Tensor, " j"],
+        config: GroupTieConfig,
+    ) -> _Seen:
+        """Of `some` drives, all moved."""
+        spacing = config.sample_spacing_m
+        places = [
+            _thinned(ways[n][:, :2, 3] + move[n, :2], spacing)
+            for n in torch.nonzero(some)[:, 0].tolist()
+        ]
+        way = torch.cat(places)
+        i, j = _nearest(line.point[:, :2], way)
+        offset = left_of_axis(line.point[i, :2] - way[j], line.direction[i]).abs()
+        return cls(line, way, float(offset.quantile(_NEARLY_ALL)) if len(offset) else 0.0)
+
+
+def _thinned(place: Float[Tensor, "f 2"], spacing: float) -> Float[Tensor, "k 2"]:
+    """Places along a way, about so far apart."""
+    if not len(place):
+        return place
+    step = (place[1:] - place[:-1]).norm(dim=1)
+    cell = (running_sum(torch.cat((step.new_zeros(1), step))) / spacing).floor()
+    return place[torch.cat((cell[:1] >= 0, cell[1:] > cell[:-1]))]
+
+
+def _nearest(
+    place: Float[Tensor, "n 2"], way: Float[Tensor, "w 2"]
+) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
+    """Rows of places that a way passes by, and the row of the nearest place on it."""
+    pairs = cross_pairs(place, way, radius=_FAR_M, count=1)
+    return pairs[:, 0], pairs[:, 1]
+
+
+_FAR_M = 30.0
+"""Farther beside a way no lane marker is seen."""
+_NEARLY_ALL = 0.95
+_FREEDOM = 4.0
+"""Degrees of freedom of shifts, as Student's t has them: a few drives tell little of how large biases are."""
+
+
+def _best_shift(
+    own: _Seen, others: _Seen, sigma: Float[Tensor, " 3"], config: GroupTieConfig
+) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]] | None:
+    """The likeliest shift of a group onto others, and a rival of it, zero where there is none; None: nothing is near."""
+    none = torch.zeros_like(sigma)
+    farthest = (config.reach * sigma[:2]).clamp_min(config.reach_m)
+    steps = (farthest / config.step_m).ceil().long().clamp_min(1)
+    axes = [config.step_m * torch.arange(-int(n), int(n) + 1).to(sigma) for n in steps]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    here, there = _Said.of(own, others, grid, config), _Said.of(others, own, -grid, config)
+    if here is None or there is None:
+        return None
+    odds = (1 + (grid / sigma[:2]).square().sum(-1) / _FREEDOM).log()
+    logs = (here.logs + there.logs) / 2 - (_FREEDOM + 2) / 2 * odds
+    best = grid.view(-1, 2)[logs.argmax()]
+    shift = torch.cat((best, _height_between(here.pairs, best, config)[None]))
+    rival = torch.cat((_rival(logs, grid, axes, best, config), none[:1]))
+    surely = logs.amax() - _log_at(logs, axes, none[:2]) > config.surer
+    # Where none is out of the question the best guess is better, whether there is another one or not.
+    return shift.where(surely & (shift.norm() > config.least_m), none), rival
+
+
+@dataclass(frozen=True)
+class _Said:
+    """What some drives' markers say of how they are to be moved."""
+
+    logs: Float[Tensor, "x y"]
+    """By shift the log-likelihood that others saw what they saw."""
+    pairs: _Pairs
+
+    @classmethod
+    def of(
+        cls, own: _Seen, others: _Seen, grid: Float[Tensor, "x y 2"], config: GroupTieConfig
+    ) -> _Said | None:
+        """Of shifts on a grid; None: hardly anything is near."""
+        here, passed = _nearest(own.line.point[:, :2], others.way)
+        count = len(here)
+        some = torch.linspace(0, count - 1, min(count, config.most_samples)).round().long()
+        some = some.to(here)
+        line, way = own.line[here[some]], others.way[passed[some]]
+        # What the drives of one group have in common says the same of the shift.
+        alike = config.alike_m * len(some) * len(torch.unique(own.line.owner[here]))
+        each = config.sample_spacing_m * count / max(alike, 1)
+        reach = float(grid[-1, -1].norm()) + config.sample_spacing_m
+        i, j, _ = pairs_between(line.point[:, :2], others.line.point[:, :2], radius=reach)
+        parallel = (line.direction[i] * others.line.direction[j]).sum(1).abs() > MAX_ANGLE_COS
+        pairs = _Pairs.of(line, others.line, i[parallel], j[parallel])
+        if len(torch.unique(pairs.row)) * each < 1:
+            return None
+        fits = torch.stack([_fits(pairs, len(line), shifts, config) for shifts in grid], dim=1)
+        offset = left_of_axis(line.point[:, :2] - way, line.direction)[:, None, None]
+        seen = others.beside + 2 * config.noise_m
+        is_seen = (offset + _across(line.direction, grid)).abs() <= seen
+        # What would not be seen is as likely as what is off by its sigma, not as what fits by chance.
+        logs = torch.log(config.missed + torch.where(is_seen, fits, math.exp(-0.5)))
+        return cls(each * (line.weight[:, None, None] * logs).sum(0), pairs)
+
+
+def _across(axis: Float[Tensor, "n 2"], shift: Float[Tensor, "*s 2"]) -> Float[Tensor, "n ..."]:
+    """How far to the left of each axis shifts lead."""
+    return _along(torch.stack((-axis[:, 1], axis[:, 0]), dim=1), shift)
+
+
+def _along(axis: Float[Tensor, "n 2"], shift: Float[Tensor, "*s 2"]) -> Float[Tensor, "n ..."]:
+    """How far along each axis shifts lead."""
+    return (axis @ shift.reshape(-1, 2).mT).view(len(axis), *shift.shape[:-1])
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Samples of a group with parallel ones of others."""
+
+    row: Int[Tensor, " p"]
+    axis: Float[Tensor, "p 2"]
+    across: Float[Tensor, " p"]
+    """How far to the left the other one is, seen along the axis."""
+    ahead: Float[Tensor, " p"]
+    above: Float[Tensor, " p"]
+
+    @classmethod
+    def of(
+        cls, own: LineSamples, others: LineSamples, i: Int[Tensor, " p"], j: Int[Tensor, " p"]
+    ) -> _Pairs:
+        """Of rows of both."""
+        delta, axis = others.point[j] - own.point[i], others.direction[j]
+        across, ahead = left_of_axis(delta[:, :2], axis), along_axis(delta[:, :2], axis)
+        return cls(i, axis, across, ahead, delta[:, 2])
+
+    def left(self, shift: Float[Tensor, "*s 2"]) -> tuple[Tensor, Tensor]:
+        """What is left across and ahead when the group has been moved, by pair and shift."""
+        gap = (1,) * (shift.ndim - 1)
+        beside = self.across.view(-1, *gap) - _across(self.axis, shift)
+        beyond = self.ahead.view(-1, *gap) - _along(self.axis, shift)
+        return beside, beyond
+
+
+def _fits(
+    pairs: _Pairs, rows: int, shifts: Float[Tensor, "s 2"], config: GroupTieConfig
+) -> Float[Tensor, "n s"]:
+    """By sample and shift how well the sample meets a marker of the others, 0 to 1."""
+    beside, beyond = pairs.left(shifts)
+    fit = torch.exp(-(beside / config.noise_m).square() / 2)
+    fit = fit.where(beyond.abs() < config.sample_spacing_m, 0)
+    best = fit.new_zeros(rows, len(shifts))
+    return best.scatter_reduce_(0, pairs.row[:, None].expand_as(fit), fit, "amax")
+
+
+def _height_between(
+    pairs: _Pairs, shift: Float[Tensor, " 2"], config: GroupTieConfig
+) -> Float[Tensor, ""]:
+    """How far above a group's markers those of the others are that they meet [m]."""
+    beside, beyond = pairs.left(shift)
+    meets = (beside.abs() < 2 * config.noise_m) & (beyond.abs() < config.sample_spacing_m)
+    if not bool(meets.any()):
+        return shift.new_zeros(())
+    return median_along(pairs.above[meets], 0)
+
+
+def _log_at(
+    logs: Float[Tensor, "x y"], axes: list[Tensor], shift: Float[Tensor, "*n 2"]
+) -> Float[Tensor, "*n"]:
+    """The log-likelihoods of shifts on the grid, or beside it of the nearest one there."""
+    places = (
+        ((shift[..., k] - axis[0]) / (axis[1] - axis[0])).round().long().clamp(0, len(axis) - 1)
+        for k, axis in enumerate(axes)
+    )
+    return logs[tuple(places)]
+
+
+def _rival(
+    logs: Float[Tensor, "x y"],
+    grid: Float[Tensor, "x y 2"],
+    axes: list[Tensor],
+    best: Float[Tensor, " 2"],
+    config: GroupTieConfig,
+) -> Float[Tensor, " 2"]:
+    """The likeliest shift far from the best one that is about as likely, and what lies between less so; zero: none."""
+    there = logs.amax()
+    others = grid.view(-1, 2)
+    is_other = (logs.flatten() > there - config.surer) & (
+        (others - best).norm(dim=1) > config.rival_m
+    )
+    others, of_other = others[is_other], logs.flatten()[is_other]
+    # Along a straight road shifts run into each other: those are one.
+    share = torch.linspace(0, 1, 17).to(best)[:, None, None]
+    between = _log_at(logs, axes, torch.lerp(best.expand_as(others), others, share)).amin(0)
+    apart = between < of_other - config.surer
+    if not bool(apart.any()):
+        return torch.zeros_like(best)
+    return others[apart][of_other[apart].argmax()]
