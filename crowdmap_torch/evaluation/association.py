@@ -49,7 +49,8 @@ def evaluate_association(
     true = sign >= 0
     together = _pairs(_cells(sign, landmark)[true & (landmark >= 0)])
     lost = (landmark < 0) & true
-    counted = true & observable[sign.clamp_min(0)]
+    # One more for what is no sign: of none that are surveyed there is no first one.
+    counted = true & torch.cat((observable, observable.new_zeros(1)))[sign]
     clean = counted & ~outlier
     return AssociationFigures(
         detections=int(true.sum()),

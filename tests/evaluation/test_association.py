@@ -50,6 +50,13 @@ def test_no_landmark_at_all(build):
     assert math.isnan(figures.pair_precision)
 
 
+def test_false_detections_of_a_road_without_signs_are_none_that_were_lost(build):
+    truth = Truth((build.drive("a", sign_rows=[(0, -1), (1, -1)]),))
+    figures = evaluate_association(associations(), truth, torch.zeros(0, dtype=torch.bool))
+    assert figures.detections == 0
+    assert math.isnan(figures.data_loss) and math.isnan(figures.pair_recall)
+
+
 def test_lost_outliers_are_told_apart(build):
     drive = build.drive("a", sign_rows=[(0, 0), (1, 0)])
     drive.sign_outlier[1] = True
