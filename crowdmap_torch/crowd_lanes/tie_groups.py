@@ -43,6 +43,8 @@ class GroupTieConfig(Settings):
     """Pieces made from fewer detections (or a quarter of the usual number, if that is less) are hardly believed."""
     most_samples: Count = 400
     """Most samples of a group that are looked at."""
+    most_drives: Count = 4
+    """Most drives of a group that are looked at: those that saw the most, there."""
     noise_m: Length = 0.3
     """1-sigma of what a marker's places in two groups are apart, their shift and the drift of both taken off."""
     missed: Share = 0.1
@@ -53,7 +55,7 @@ class GroupTieConfig(Settings):
     """Shifts up to this many of their standard deviations are tried along each axis, or ..."""
     reach_m: Length = 4.0
     """... up to this, if that is more: how large biases are is known by few drives."""
-    step_m: Spacing = 0.25
+    step_m: Spacing = 0.4
     """Between shifts that are tried."""
     least_m: Length = 0.5
     """Smaller shifts are left to the adjustment, which finds the way by itself."""
@@ -72,7 +74,7 @@ class GroupTies:
     group: Int[Tensor, " j"]
     """The group of each journey."""
     rival: Float[Tensor, "g 3"]
-    """By group another shift that the lanes fit about as well [m]; zero where there is none."""
+    """By group another place that the lanes fit about as well, seen from where it is put [m]; zero: there is none."""
 
     @property
     def open_groups(self) -> list[int]:
@@ -114,8 +116,9 @@ def tie_groups(
         for one in list(left):
             own = group == one
             moved = replace(samples, point=samples.point + move[samples.owner])
-            others = _Seen.of(moved[placed[samples.owner]], ways, move, placed, config)
-            of_one = _Seen.of(moved[of_sample == one], ways, move, own, config)
+            of_one = _Seen.of(moved[of_sample == one], ways, move, config)
+            of_others = moved[placed[samples.owner]]
+            others = _Seen.of(of_others, ways, move, config, beside=of_one.way)
             of_own, of_placed = (_variance_of_mean(bias_sigma, some) for some in (own, placed))
             sigma = (of_own + of_placed).sqrt()
             best = _best_shift(of_one, others, sigma, drifting)
@@ -153,16 +156,20 @@ class _Seen:
         line: LineSamples,
         ways: Sequence[Float[Tensor, "_ 4 4"]],
         move: Float[Tensor, "j 3"],
-        some: Bool[Tensor, " j"],
         config: GroupTieConfig,
+        *,
+        beside: Float[Tensor, "w 2"] | None = None,
     ) -> _Seen:
-        """Of `some` drives, all moved."""
-        spacing = config.sample_spacing_m
+        """Of drives that are moved, those that saw the most; of what lies `beside` another way, if there is one."""
+        near = line if beside is None else line[_nearest(line.point[:, :2], beside)[0]]
+        count = torch.bincount(near.owner, minlength=len(move))
+        most = torch.argsort(count, descending=True, stable=True)[: config.most_drives]
+        drives = most[count[most] > 0].tolist()
+        line = line[torch.isin(line.owner, most)]
         places = [
-            _thinned(ways[n][:, :2, 3] + move[n, :2], spacing)
-            for n in torch.nonzero(some)[:, 0].tolist()
+            _thinned(ways[n][:, :2, 3] + move[n, :2], config.sample_spacing_m) for n in drives
         ]
-        way = torch.cat(places)
+        way = torch.cat((move.new_zeros(0, 2), *places))
         i, j = _nearest(line.point[:, :2], way)
         offset = left_of_axis(line.point[i, :2] - way[j], line.direction[i]).abs()
         return cls(line, way, float(offset.quantile(_NEARLY_ALL)) if len(offset) else 0.0)
@@ -195,7 +202,7 @@ _FREEDOM = 4.0
 def _best_shift(
     own: _Seen, others: _Seen, sigma: Float[Tensor, " 3"], config: GroupTieConfig
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]] | None:
-    """The likeliest shift of a group onto others, and a rival of it, zero where there is none; None: nothing is near."""
+    """The likeliest shift of a group onto others, and from there to a rival, zero where none is; None: nothing is near."""
     none = torch.zeros_like(sigma)
     farthest = (config.reach * sigma[:2]).clamp_min(config.reach_m)
     steps = (farthest / config.step_m).ceil().long().clamp_min(1)
@@ -206,12 +213,16 @@ def _best_shift(
         return None
     odds = (1 + (grid / sigma[:2]).square().sum(-1) / _FREEDOM).log()
     logs = (here.logs + there.logs) / 2 - (_FREEDOM + 2) / 2 * odds
-    best = grid.view(-1, 2)[logs.argmax()]
+    best = _peak(logs, axes)
+    other = _rival(logs, grid, axes, best, config)
     shift = torch.cat((best, _height_between(here.pairs, best, config)[None]))
-    rival = torch.cat((_rival(logs, grid, axes, best, config), none[:1]))
     surely = logs.amax() - _log_at(logs, axes, none[:2]) > config.surer
     # Where none is out of the question the best guess is better, whether there is another one or not.
-    return shift.where(surely & (shift.norm() > config.least_m), none), rival
+    is_moved = surely & (shift.norm() > config.least_m)
+    farther = torch.where(best.norm() > other.norm(), best, other)
+    away = torch.where(is_moved, other - best, farther)
+    is_open = other.any() & (away.norm() > config.rival_m)
+    return shift.where(is_moved, none), torch.cat((away.where(is_open, none[:2]), none[:1]))
 
 
 @dataclass(frozen=True)
@@ -308,6 +319,20 @@ def _height_between(
     if not bool(meets.any()):
         return shift.new_zeros(())
     return median_along(pairs.above[meets], 0)
+
+
+def _peak(logs: Float[Tensor, "x y"], axes: list[Tensor]) -> Float[Tensor, " 2"]:
+    """The likeliest shift, between those of the grid by parabolas."""
+    at = torch.unravel_index(logs.argmax(), logs.shape)
+    places = []
+    for k, axis in enumerate(axes):
+        line, i = logs.select(1 - k, int(at[1 - k])), int(at[k])
+        step, beyond = axis[1] - axis[0], axis.new_zeros(())
+        if 0 < i < len(axis) - 1:
+            bend = line[i - 1] - 2 * line[i] + line[i + 1]
+            beyond = (line[i - 1] - line[i + 1]) / (2 * bend.clamp_max(-1e-12))
+        places.append(axis[i] + step * beyond.clamp(-0.5, 0.5))
+    return torch.stack(places)
 
 
 def _log_at(
