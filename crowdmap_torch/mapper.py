@@ -260,9 +260,10 @@ def first_map(
         pieces = unbiased_pieces(made, drifts, trusted := crowd.trusted_frames(journeys))
         known = groups_of(crowd), gathered.bias_sigma, crowd.positioning
         ties = tie_groups(pieces, poses, *known, config.lane_join.tie_groups)
-        crowd = crowd.moved(ties.move)
-        poses, drifts = without_bias(given, crowd.bias)
-        pieces = unbiased_pieces(made, drifts, trusted)
+        if bool(ties.move.any()):
+            crowd = crowd.moved(ties.move)
+            poses, drifts = without_bias(given, crowd.bias)
+            pieces = unbiased_pieces(made, drifts, trusted)
         joined = join_lanes(pieces, crowd.positioning, config.lane_join)
         lanes, support, rounds = joined.lanes, joined.support, ()
     else:

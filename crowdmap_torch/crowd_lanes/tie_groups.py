@@ -26,9 +26,9 @@ from crowdmap_torch.crowd_lanes.line_samples import (
     left_of_axis,
 )
 from crowdmap_torch.crowd_lanes.samples import sample_lanes
+from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.robust import median_along
-from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.ranges import Count, Deviations, Factor, Length, Settings, Share, Spacing
 from crowdmap_torch.tables import Lanes
 
@@ -166,22 +166,17 @@ class _Seen:
         most = torch.argsort(count, descending=True, stable=True)[: config.most_drives]
         drives = most[count[most] > 0].tolist()
         line = line[torch.isin(line.owner, most)]
-        places = [
-            _thinned(ways[n][:, :2, 3] + move[n, :2], config.sample_spacing_m) for n in drives
-        ]
+        places = [_thinned(ways[n], config.sample_spacing_m) + move[n, :2] for n in drives]
         way = torch.cat((move.new_zeros(0, 2), *places))
         i, j = _nearest(line.point[:, :2], way)
         offset = left_of_axis(line.point[i, :2] - way[j], line.direction[i]).abs()
         return cls(line, way, float(offset.quantile(_NEARLY_ALL)) if len(offset) else 0.0)
 
 
-def _thinned(place: Float[Tensor, "f 2"], spacing: float) -> Float[Tensor, "k 2"]:
+def _thinned(way: Float[Tensor, "f 4 4"], spacing: float) -> Float[Tensor, "k 2"]:
     """Places along a way, about so far apart."""
-    if not len(place):
-        return place
-    step = (place[1:] - place[:-1]).norm(dim=1)
-    cell = (running_sum(torch.cat((step.new_zeros(1), step))) / spacing).floor()
-    return place[torch.cat((cell[:1] >= 0, cell[1:] > cell[:-1]))]
+    cell = (station(way) / spacing).floor()
+    return way[torch.cat((cell[:1] >= 0, cell[1:] > cell[:-1])), :2, 3]
 
 
 def _nearest(
