@@ -210,7 +210,8 @@ def _best_shift(
     logs = (here.logs + there.logs) / 2 - (_FREEDOM + 2) / 2 * odds
     best = _peak(logs, axes)
     other = _rival(logs, grid, axes, best, config)
-    shift = torch.cat((best, _height_between(here.pairs, best, config)[None]))
+    mean = _mean_near(logs, grid, axes, best, config)
+    shift = torch.cat((mean, _height_between(here.pairs, mean, config)[None]))
     surely = logs.amax() - _log_at(logs, axes, none[:2]) > config.surer
     # Where none is out of the question the best guess is better, whether there is another one or not.
     is_moved = surely & (shift.norm() > config.least_m)
@@ -356,9 +357,32 @@ def _rival(
     )
     others, of_other = others[is_other], logs.flatten()[is_other]
     # Along a straight road shifts run into each other: those are one.
-    share = torch.linspace(0, 1, 17).to(best)[:, None, None]
-    between = _log_at(logs, axes, torch.lerp(best.expand_as(others), others, share)).amin(0)
-    apart = between < of_other - config.surer
+    apart = _lowest_between(logs, axes, best, others) < of_other - config.surer
     if not bool(apart.any()):
         return torch.zeros_like(best)
     return others[apart][of_other[apart].argmax()]
+
+
+def _mean_near(
+    logs: Float[Tensor, "x y"],
+    grid: Float[Tensor, "x y 2"],
+    axes: list[Tensor],
+    best: Float[Tensor, " 2"],
+    config: GroupTieConfig,
+) -> Float[Tensor, " 2"]:
+    """The mean of the shifts around the best one, by their likelihood: along a road that hardly bends it errs by less."""
+    shifts, likely = grid.view(-1, 2), (logs - logs.amax()).exp().flatten()
+    is_near = _lowest_between(logs, axes, best, shifts) >= logs.flatten() - config.surer
+    weight = likely.where(is_near, 0)
+    return (weight[:, None] * shifts).sum(0) / weight.sum()
+
+
+def _lowest_between(
+    logs: Float[Tensor, "x y"],
+    axes: list[Tensor],
+    best: Float[Tensor, " 2"],
+    others: Float[Tensor, "n 2"],
+) -> Float[Tensor, " n"]:
+    """The least log-likelihood on the straight way from the best shift to each of others."""
+    share = torch.linspace(0, 1, 17).to(best)[:, None, None]
+    return _log_at(logs, axes, torch.lerp(best.expand_as(others), others, share)).amin(0)

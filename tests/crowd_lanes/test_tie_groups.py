@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from worlds import lane_world
 
-from crowdmap_torch.crowd_lanes.tie_groups import GroupTieConfig, GroupTies, tie_groups
+from crowdmap_torch.crowd_lanes.tie_groups import GroupTieConfig, GroupTies, _mean_near, tie_groups
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.tables import Lanes
@@ -109,6 +109,17 @@ def test_what_fits_as_well_otherwise_is_told():
     assert abs(abs(float(relative(ties)[1])) - 1.75) < 0.3
     # The other one is to the other side.
     assert abs(float(ties.rival[1, 1] + 2 * relative(ties)[1])) < 0.3
+
+
+@pytest.mark.parametrize(("valley", "mean"), [(-1.0, 0.0), (-20.0, -2.0)])
+def test_shifts_that_run_into_each_other_are_averaged(valley: float, mean: float):
+    axis = torch.arange(-4, 5).double()
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1)
+    along_the_road = torch.full((9,), -30.0).double()
+    along_the_road[2:7] = torch.tensor([0.0, valley, valley, valley, 0.0])
+    logs = along_the_road[:, None] - 50 * axis.square()
+    found = _mean_near(logs, grid, [axis, axis], torch.tensor([-2.0, 0.0]).double(), CONFIG)
+    torch.testing.assert_close(found, torch.tensor([mean, 0.0]).double(), rtol=0, atol=1e-6)
 
 
 def test_who_is_known_better_stays():
