@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
 from crowdmap_torch.optim.solvers.assembly import Costs, cost_and_gradient
 from crowdmap_torch.optim.solvers.normal_equations import Correctable, Tangents
@@ -54,7 +55,8 @@ class Point:
 class Corrected:
     """What corrections have come to."""
 
-    at: Point
+    values: Values
+    costs: Costs
     count: int
     """How many were tried."""
     converged: Bool[Tensor, " 1"]
@@ -108,28 +110,43 @@ def corrected(
     They end with the first that raises the cost, which is not taken, that lowers it by less than the tolerance, or by much
     less than it promised.
     """
-    here, move, pairs = first, packed(step, step), ()
+    values, costs, slope = first.values, first.costs, first.gradient
+    move, pairs = packed(step, step), ()
     gradient, newton = packed(normal.tangent_gradient, step), move
     lifted = -gradient
-    converged = torch.zeros_like(first.costs.total, dtype=torch.bool)
+    converged = torch.zeros_like(costs.total, dtype=torch.bool)
 
     def dot(one: Float[Tensor, " n"], other: Float[Tensor, " n"]) -> Float[Tensor, ""]:
         return problem.dot(one, other, step)
 
     for count in range(1, most + 1):
-        new = packed(normal.correct(unpacked(here.gradient, step)).delta, step)
-        pair = _Pair.of(dot, move, lifted, here.gradient - gradient, newton - new)
-        pairs, gradient, newton = (*pairs, pair), here.gradient, new
+        new = packed(normal.correct(unpacked(slope, step)).delta, step)
+        pair = _Pair.of(dot, move, lifted, slope - gradient, newton - new)
+        pairs, gradient, newton = (*pairs, pair), slope, new
         move, lifted = _quasi_newton(dot, gradient, newton, pairs)
-        at = Point.of(problem, retract(problem, here.values, unpacked(move, step)), step)
-        decrease, promised = here.costs.total - at.costs.total, -dot(gradient, move) / 2
+        promised = -dot(gradient, move) / 2
+        next_values = retract(problem, values, unpacked(move, step))
+        # The last one needs no gradient, which takes twice as long as costs.
+        is_last = count == most or bool(promised <= cost_tolerance * costs.total)
+        point = None if is_last else Point.of(problem, next_values, step)
+        next_costs = _costs(problem, next_values) if point is None else point.costs
+        decrease = costs.total - next_costs.total
         # Neither is it taken where it is not a number.
         if not bool(decrease > 0):
-            return Corrected(here, count, converged)
-        here, converged = at, decrease <= cost_tolerance * at.costs.total
+            return Corrected(values, costs, count, converged)
+        values, costs = next_values, next_costs
+        converged = decrease <= cost_tolerance * costs.total
         if bool(converged | (decrease < _SERVES * promised)):
-            return Corrected(here, count, converged)
-    return Corrected(here, most, converged)
+            return Corrected(values, costs, count, converged)
+        if count < most:
+            slope = (point or Point.of(problem, values, step)).gradient
+    return Corrected(values, costs, most, converged)
+
+
+def _costs(problem: Problem, values: Values) -> Costs:
+    """What the terms cost at values."""
+    by_term = term_costs(problem, values)
+    return Costs(torch.stack(list(by_term.values())).sum(0), by_term)
 
 
 def _quasi_newton(

@@ -32,6 +32,8 @@ _UNDAMPED = 1e-6
 """Steps that are damped by more are short by themselves: they say nothing of how far the minimum is."""
 _NEAR_BEST = 0.2
 """Steps that should be longer or shorter by less than this share stay as they are."""
+_FAR = 0.02
+"""Steps that lower the cost by more than this share stay as well: weights change on the way, and it is no parabola."""
 REASONS = (
     "still running",
     "converged: the cost no longer falls",
@@ -169,12 +171,13 @@ def step(
             most=config.corrections,
             cost_tolerance=config.cost_tolerance,
         )
-    if after is not None and after.at is not point:
-        trial = after.at.values, after.at.costs.by_term, after.at.costs.total
+    if after is not None and point is not None and after.costs is not point.costs:
+        trial = after.values, after.costs.by_term, after.costs.total
         reason[after.converged] = CONVERGED_COST
     elif config.max_stretch > 1:
         # Along the step the cost is a parabola by its slope and by where it came out: this is its lowest point.
-        best = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(accepted, length)
+        is_near = accepted & (decrease < _FAR * normal.cost)
+        best = (1 / (2 - gain).clamp_min(1 / config.max_stretch)).where(is_near, length)
         if bool(((best - 1).abs() > _NEAR_BEST).any()):
             other = _trial(problem, state.values, proposal.delta, best)
             length = torch.where(other[2] < trial[2], best, length)

@@ -115,13 +115,16 @@ class _Rough:
         return Correction({"x": step[None]}, in_sigmas[None])
 
 
-def _bowl(sides=(1.0, 3.0, 10.0)):
-    """A bowl with its minimum at zero, a point of it, and equations that are wrong by factors from 1 to 2."""
-    scale = torch.tensor(sides).double()
+def _bowl(sides=(1.0, 3.0, 10.0), above=0.0):
+    """A bowl with its minimum at zero, a point of it, and equations that are wrong by factors from 1 to 2.
+
+    It costs half the square of `above` more.
+    """
+    scale, more = torch.tensor(sides).double(), torch.tensor([above]).double()
     n = len(sides)
 
     def residual(x):
-        return scale * x
+        return torch.cat((scale * x, more))
 
     term = CostTerm(residual, (("x", torch.zeros(1, dtype=torch.long)),))
     problem = Problem({"x": Variable(n, euclidean)}, {"bowl": term})
@@ -137,7 +140,7 @@ def test_pairs_find_the_minimum_of_a_bowl_whatever_the_matrix():
     first = Point.of(problem, {"x": values["x"] + step["x"]}, step)
     found = corrected(problem, normal, step, first, most=12, cost_tolerance=1e-12)
     # A matrix alone, right to a factor of two, halves what is left at each step: 2^-24 of the cost after twelve.
-    assert float(found.at.costs.total) < 1e-10 * float(normal.cost)
+    assert float(found.costs.total) < 1e-10 * float(normal.cost)
     assert len(normal.asked) == 1 + found.count
 
 
@@ -148,7 +151,7 @@ def test_a_correction_that_raises_the_cost_is_not_taken():
     # A matrix that is far too small sends the next step far beyond the minimum.
     normal.matrix = normal.matrix / 1e3
     found = corrected(problem, normal, step, first, most=5, cost_tolerance=1e-12)
-    assert found.at.costs.total <= first.costs.total
+    assert found.costs.total <= first.costs.total
     assert not bool(found.converged)
 
 
@@ -162,8 +165,10 @@ class _OnlyOnce:
         return self.normal
 
 
-def test_where_corrections_fail_the_step_is_made_longer():
-    problem, values, normal = _bowl()
+@pytest.mark.parametrize(("above", "stretch"), [(200.0, 2.0), (20.0, 1.0)])
+def test_where_corrections_fail_a_step_that_changes_little_is_made_longer(above, stretch):
+    # The step takes some fifty of a cost of 20,000, or of 200, where weights would have changed on the way.
+    problem, values, normal = _bowl(above=above)
     # Twice the curvature everywhere: the step leads half the way, and its factors are lost.
     normal.matrix = 2 * DenseBackend().assemble(problem, values).hessian[0]
     nothing = torch.full((1,), torch.nan)
@@ -172,8 +177,8 @@ def test_where_corrections_fail_the_step_is_made_longer():
     state = lm.init(problem, values, config)
     state = lm.step(problem, state, config, backend=_OnlyOnce(normal))
     assert state.corrections == 1
-    torch.testing.assert_close(state.stretch, torch.full_like(state.cost, 2.0))
-    torch.testing.assert_close(state.values["x"], torch.zeros_like(values["x"]))
+    torch.testing.assert_close(state.stretch, torch.full_like(state.cost, stretch))
+    torch.testing.assert_close(state.values["x"], values["x"] * (1 - stretch / 2))
 
 
 def test_equations_without_kept_factors_take_plain_steps():
