@@ -34,6 +34,7 @@ from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.robust import Huber, Tukey
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
+from crowdmap_torch.processes.memory import keep_in_one_place
 from crowdmap_torch.processes.threads import one_core_each, repeatable
 from crowdmap_torch.ranges import Rounds, Workers, argument
 
@@ -98,6 +99,7 @@ def solve(
 ) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:
     """Huber's stage, then Tukey's from its result; poses eliminated along their chains."""
     # As the mapper does.
+    keep_in_one_place()
     repeatable(device)
     start = time.perf_counter()
     # What a process loads at its first operations (threads, kernels) is set-up.

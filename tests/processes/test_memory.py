@@ -83,3 +83,35 @@ def test_threads_share_a_heap_where_they_are_told_to(tmp_path):
 
     assert heaps() > 1
     assert heaps("together") == 1
+
+
+_AGAIN = """
+import ctypes, resource, sys
+from crowdmap_torch.processes.memory import keep_in_one_place
+if "together" in sys.argv:
+    keep_in_one_place()
+c = ctypes.CDLL(None)
+c.malloc.restype = ctypes.c_void_p
+c.malloc.argtypes = [ctypes.c_size_t]
+c.free.argtypes = [ctypes.c_void_p]
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+begun = faults()
+for _ in range(10):
+    blocks = [c.malloc(20 << 20) for _ in range(6)]
+    for block in blocks:
+        ctypes.memset(block, 1, 20 << 20)
+    for block in blocks:
+        c.free(block)
+print(faults() - begun)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to")
+def test_what_was_freed_is_taken_again_where_it_is_told_to():
+    def faults(*told: str) -> int:
+        command = [sys.executable, "-c", _AGAIN, *told]
+        return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+    # 120 MB are cleared by the system once, or ten times.
+    assert faults("together") < faults() / 3
