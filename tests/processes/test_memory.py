@@ -98,9 +98,9 @@ def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 begun = faults()
 for _ in range(10):
-    blocks = [c.malloc(20 << 20) for _ in range(6)]
+    blocks = [c.malloc(18 << 20) for _ in range(3)]
     for block in blocks:
-        ctypes.memset(block, 1, 20 << 20)
+        ctypes.memset(block, 1, 18 << 20)
     for block in blocks:
         c.free(block)
 print(faults() - begun)
@@ -113,5 +113,5 @@ def test_what_was_freed_is_taken_again_where_it_is_told_to():
         command = [sys.executable, "-c", _AGAIN, *told]
         return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
-    # 120 MB are cleared by the system once, or ten times.
+    # 54 MB are cleared by the system once, or ten times.
     assert faults("together") < faults() / 3
