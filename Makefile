@@ -56,7 +56,7 @@ test-coverage: $(STAMP)  ## the test suite, and which lines it does not reach
 lint: $(STAMP)  ## ruff and pyright
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --threads 2
 
 format: $(STAMP)  ## format and sort imports
 	$(BIN)/ruff check --fix .

@@ -10,7 +10,7 @@ from typing import Any
 import jaxtyping
 from beartype import BeartypeConf, beartype
 
-CALLS = 50
+CALLS = 10
 """Calls of a function that are checked in each file of tests: checks of all of them take as long as the tests."""
 
 _typed = beartype(conf=BeartypeConf(is_pep484_tower=True))
