@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
 from crowdmap_torch.optim.solvers.assembly import Costs, cost_and_gradient
 from crowdmap_torch.optim.solvers.normal_equations import Correctable, Tangents
@@ -129,7 +128,7 @@ def corrected(
         # The last one needs no gradient, which takes twice as long as costs.
         is_last = count == most or bool(promised <= cost_tolerance * costs.total)
         point = None if is_last else Point.of(problem, next_values, step)
-        next_costs = _costs(problem, next_values) if point is None else point.costs
+        next_costs = Costs.at(problem, next_values) if point is None else point.costs
         decrease = costs.total - next_costs.total
         # Neither is it taken where it is not a number.
         if not bool(decrease > 0):
@@ -141,12 +140,6 @@ def corrected(
         if count < most:
             slope = (point or Point.of(problem, values, step)).gradient
     return Corrected(values, costs, most, converged)
-
-
-def _costs(problem: Problem, values: Values) -> Costs:
-    """What the terms cost at values."""
-    by_term = term_costs(problem, values)
-    return Costs(torch.stack(list(by_term.values())).sum(0), by_term)
 
 
 def _quasi_newton(

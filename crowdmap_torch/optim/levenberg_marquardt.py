@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.corrections import Point, corrected
-from crowdmap_torch.optim.linearize import term_costs
 from crowdmap_torch.optim.problem import Problem, Values, retract
-from crowdmap_torch.optim.solvers.assembly import cost_and_gradient
+from crowdmap_torch.optim.solvers.assembly import Costs, cost_and_gradient
 from crowdmap_torch.optim.solvers.dense import DenseBackend
 from crowdmap_torch.optim.solvers.normal_equations import (
     Backend,
@@ -117,7 +116,7 @@ def init(
 ) -> LmState:
     """The state before the first step: the cost at `values`, nothing moved; by a back end with its normal equations."""
     normal = None if backend is None else backend.assemble(problem, values)
-    term_cost = term_costs(problem, values) if normal is None else normal.term_cost
+    term_cost = Costs.at(problem, values).by_term if normal is None else normal.term_cost
     cost = torch.stack(list(term_cost.values())).sum(0)
     nothing = torch.zeros_like(cost)
     return LmState(
@@ -257,8 +256,8 @@ def _trial(
 ) -> _Trial:
     """What comes out at a multiple of the step."""
     candidate = retract(problem, values, _scaled(problem, delta, length))
-    term_cost = term_costs(problem, candidate)
-    return candidate, term_cost, torch.stack(list(term_cost.values())).sum(0)
+    costs = Costs.at(problem, candidate)
+    return candidate, costs.by_term, costs.total
 
 
 def _scaled(

@@ -14,7 +14,7 @@ ARROW_POOL = "ARROW_DEFAULT_MEMORY_POOL"
 _ARENA_MAX, _MMAP_THRESHOLD, _TRIM_THRESHOLD = -8, -3, -1
 """`M_ARENA_MAX`, `M_MMAP_THRESHOLD` and `M_TRIM_THRESHOLD` of malloc.h."""
 _OWN_PAGES = 32 << 20
-"""Tensors of at least so many bytes have pages of their own, which go with them: the most that glibc takes."""
+"""Tensors of at least so many bytes have pages of their own, which go with them: the most that an older glibc takes."""
 _FREE_AT_TOP = 64 << 20
 """Bytes that are freed at the heap's end before they go back by themselves; with 256 MB 25 drives hold 0.1 GB more."""
 _STATUS, _PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -42,8 +42,8 @@ def keep_in_one_place() -> None:
     """From now on threads share what was freed, and tensors take it again (glibc); to be called before there are threads.
 
     Each would keep a heap of its own: an eighth of what a map of 25 drives takes, and no time is saved by it. Pages that
-    go back are asked for again and cleared anew: a fifth of the system's time of an adjustment, half of it of a small one.
-    What is not needed for long `give_back` hands back.
+    go back are asked for again and cleared anew, which was a seventh of the time of a small adjustment. What is not needed
+    for long `give_back` hands back.
     """
     library = _library()
     if library is not None:

@@ -15,6 +15,7 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.io.stages import read_stage, write_stage
 from crowdmap_torch.io.trees import digest
 from crowdmap_torch.optim import levenberg_marquardt as lm
+from crowdmap_torch.optim.solvers import assembly
 
 
 def test_increments_are_zero_at_rest(street: Street, adjusted: Adjusted):
@@ -40,7 +41,7 @@ def test_a_bundle_goes_on_from_its_state_dict(street: Street, adjusted: Adjusted
 
 def reject_steps(monkeypatch: pytest.MonkeyPatch, numbers: tuple[int, ...]) -> None:
     """Makes these steps end where everything costs more."""
-    step, costs, is_bad = lm.step, lm.term_costs, [False]
+    step, costs, is_bad = lm.step, assembly.term_costs, [False]
 
     def taken(problem, state, *arguments, **options):
         is_bad[0] = state.iterations in numbers
@@ -50,7 +51,7 @@ def reject_steps(monkeypatch: pytest.MonkeyPatch, numbers: tuple[int, ...]) -> N
         return {k: cost + 1e9 * is_bad[0] for k, cost in costs(*arguments).items()}
 
     monkeypatch.setattr(lm, "step", taken)
-    monkeypatch.setattr(lm, "term_costs", dearer)
+    monkeypatch.setattr(assembly, "term_costs", dearer)
 
 
 @pytest.mark.parametrize(

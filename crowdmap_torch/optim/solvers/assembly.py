@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import RowBlocks, of_pieces, row_gradients
+from crowdmap_torch.optim.linearize import RowBlocks, of_pieces, row_gradients, term_costs
 from crowdmap_torch.optim.problem import CostTerm, Problem, Values, Variable
 from crowdmap_torch.processes.sums import add_at, lasting
 
@@ -71,6 +71,12 @@ class Costs:
 
     total: Float[Tensor, " groups"]
     by_term: Mapping[str, Float[Tensor, " groups"]]
+
+    @classmethod
+    def at(cls, problem: Problem, values: Values) -> Costs:
+        """What the terms of everybody cost at values, without any derivative."""
+        by_term = term_costs(problem, values)
+        return cls(torch.stack(list(by_term.values())).sum(0), by_term)
 
 
 def assemble(
