@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -208,11 +209,10 @@ def _best_shift(
         return None
     odds = (1 + (grid / sigma[:2]).square().sum(-1) / _FREEDOM).log()
     logs = (here.logs + there.logs) / 2 - (_FREEDOM + 2) / 2 * odds
-    best = _peak(logs, axes)
-    other = _rival(logs, grid, axes, best, config)
-    mean = _mean_near(logs, grid, axes, best, config)
+    told = _Told(logs, grid, axes, config)
+    best, other, mean = told.best, told.rival(), told.mean()
     shift = torch.cat((mean, _height_between(here.pairs, mean, config)[None]))
-    surely = logs.amax() - _log_at(logs, axes, none[:2]) > config.surer
+    surely = logs.amax() - told.at(none[:2]) > config.surer
     # Where none is out of the question the best guess is better, whether there is another one or not.
     is_moved = surely & (shift.norm() > config.least_m)
     farther = torch.where(best.norm() > other.norm(), best, other)
@@ -317,72 +317,64 @@ def _height_between(
     return median_along(pairs.above[meets], 0)
 
 
-def _peak(logs: Float[Tensor, "x y"], axes: list[Tensor]) -> Float[Tensor, " 2"]:
-    """The likeliest shift, between those of the grid by parabolas."""
-    at = torch.unravel_index(logs.argmax(), logs.shape)
-    places = []
-    for k, axis in enumerate(axes):
-        line, i = logs.select(1 - k, int(at[1 - k])), int(at[k])
-        step, beyond = axis[1] - axis[0], axis.new_zeros(())
-        if 0 < i < len(axis) - 1:
-            bend = line[i - 1] - 2 * line[i] + line[i + 1]
-            beyond = (line[i - 1] - line[i + 1]) / (2 * bend.clamp_max(-1e-12))
-        places.append(axis[i] + step * beyond.clamp(-0.5, 0.5))
-    return torch.stack(places)
+@dataclass(frozen=True)
+class _Told:
+    """What lanes and priors tell of a group's shift."""
 
+    logs: Float[Tensor, "x y"]
+    """By shift its log-likelihood."""
+    grid: Float[Tensor, "x y 2"]
+    axes: list[Tensor]
+    """The shifts that are tried, and those along each axis [m]."""
+    config: GroupTieConfig
 
-def _log_at(
-    logs: Float[Tensor, "x y"], axes: list[Tensor], shift: Float[Tensor, "*n 2"]
-) -> Float[Tensor, "*n"]:
-    """The log-likelihoods of shifts on the grid, or beside it of the nearest one there."""
-    places = (
-        ((shift[..., k] - axis[0]) / (axis[1] - axis[0])).round().long().clamp(0, len(axis) - 1)
-        for k, axis in enumerate(axes)
-    )
-    return logs[tuple(places)]
+    @cached_property
+    def best(self) -> Float[Tensor, " 2"]:
+        """The likeliest shift, between those of the grid by parabolas."""
+        at = torch.unravel_index(self.logs.argmax(), self.logs.shape)
+        places = []
+        for k, axis in enumerate(self.axes):
+            line, i = self.logs.select(1 - k, int(at[1 - k])), int(at[k])
+            step, beyond = axis[1] - axis[0], axis.new_zeros(())
+            if 0 < i < len(axis) - 1:
+                bend = line[i - 1] - 2 * line[i] + line[i + 1]
+                beyond = (line[i - 1] - line[i + 1]) / (2 * bend.clamp_max(-1e-12))
+            places.append(axis[i] + step * beyond.clamp(-0.5, 0.5))
+        return torch.stack(places)
 
+    def at(self, shift: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
+        """The log-likelihoods of shifts on the grid, or beside it of the nearest one there."""
+        places = (
+            ((shift[..., k] - axis[0]) / (axis[1] - axis[0])).round().long().clamp(0, len(axis) - 1)
+            for k, axis in enumerate(self.axes)
+        )
+        return self.logs[tuple(places)]
 
-def _rival(
-    logs: Float[Tensor, "x y"],
-    grid: Float[Tensor, "x y 2"],
-    axes: list[Tensor],
-    best: Float[Tensor, " 2"],
-    config: GroupTieConfig,
-) -> Float[Tensor, " 2"]:
-    """The likeliest shift far from the best one that is about as likely, and what lies between less so; zero: none."""
-    there = logs.amax()
-    others = grid.view(-1, 2)
-    is_other = (logs.flatten() > there - config.surer) & (
-        (others - best).norm(dim=1) > config.rival_m
-    )
-    others, of_other = others[is_other], logs.flatten()[is_other]
-    # Along a straight road shifts run into each other: those are one.
-    apart = _lowest_between(logs, axes, best, others) < of_other - config.surer
-    if not bool(apart.any()):
-        return torch.zeros_like(best)
-    return others[apart][of_other[apart].argmax()]
+    def rival(self) -> Float[Tensor, " 2"]:
+        """The likeliest shift far from the best one that is about as likely, and what lies between less so; zero: none."""
+        others, likely = self.grid.view(-1, 2), self.logs.flatten()
+        is_other = (likely > likely.amax() - self.config.surer) & (
+            (others - self.best).norm(dim=1) > self.config.rival_m
+        )
+        others, likely = others[is_other], likely[is_other]
+        apart = self._is_apart(others, likely)
+        if not bool(apart.any()):
+            return torch.zeros_like(self.best)
+        return others[apart][likely[apart].argmax()]
 
+    def mean(self) -> Float[Tensor, " 2"]:
+        """The mean of the shifts around the best one, by likelihood: along a road that hardly bends it errs by less."""
+        shifts, logs = self.grid.view(-1, 2), self.logs.flatten()
+        weight = (logs - logs.amax()).exp().where(~self._is_apart(shifts, logs), 0)
+        return (weight[:, None] * shifts).sum(0) / weight.sum()
 
-def _mean_near(
-    logs: Float[Tensor, "x y"],
-    grid: Float[Tensor, "x y 2"],
-    axes: list[Tensor],
-    best: Float[Tensor, " 2"],
-    config: GroupTieConfig,
-) -> Float[Tensor, " 2"]:
-    """The mean of the shifts around the best one, by their likelihood: along a road that hardly bends it errs by less."""
-    shifts, likely = grid.view(-1, 2), (logs - logs.amax()).exp().flatten()
-    is_near = _lowest_between(logs, axes, best, shifts) >= logs.flatten() - config.surer
-    weight = likely.where(is_near, 0)
-    return (weight[:, None] * shifts).sum(0) / weight.sum()
+    def _is_apart(
+        self, others: Float[Tensor, "n 2"], likely: Float[Tensor, " n"]
+    ) -> Bool[Tensor, " n"]:
+        """Whether something between the best shift and each of others is less likely than it.
 
-
-def _lowest_between(
-    logs: Float[Tensor, "x y"],
-    axes: list[Tensor],
-    best: Float[Tensor, " 2"],
-    others: Float[Tensor, "n 2"],
-) -> Float[Tensor, " n"]:
-    """The least log-likelihood on the straight way from the best shift to each of others."""
-    share = torch.linspace(0, 1, 17).to(best)[:, None, None]
-    return _log_at(logs, axes, torch.lerp(best.expand_as(others), others, share)).amin(0)
+        Along a straight road shifts run into each other: those are one.
+        """
+        share = torch.linspace(0, 1, 17).to(self.best)[:, None, None]
+        between = self.at(torch.lerp(self.best.expand_as(others), others, share)).amin(0)
+        return between < likely - self.config.surer

@@ -116,15 +116,15 @@ def init(
 ) -> LmState:
     """The state before the first step: the cost at `values`, nothing moved; by a back end with its normal equations."""
     normal = None if backend is None else backend.assemble(problem, values)
-    term_cost = Costs.at(problem, values).by_term if normal is None else normal.term_cost
-    cost = torch.stack(list(term_cost.values())).sum(0)
+    costs = Costs.at(problem, values) if normal is None else Costs(normal.cost, normal.term_cost)
+    cost = costs.total
     nothing = torch.zeros_like(cost)
     return LmState(
         values=values,
         damping=torch.full_like(nothing, config.initial_damping),
         growth=torch.full_like(nothing, 2.0),
         cost=cost,
-        term_cost=term_cost,
+        term_cost=costs.by_term,
         gain_ratio=nothing,
         step_norm=nothing,
         stretch=torch.ones_like(cost),
