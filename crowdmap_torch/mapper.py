@@ -22,6 +22,7 @@ from crowdmap_torch.adjustment.footing import Footing, footing_of
 from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
 from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_pieces
+from crowdmap_torch.crowd_lanes.joined_anew import joined_anew
 from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
 from crowdmap_torch.crowd_lanes.tie_groups import GroupTies, tie_groups
 from crowdmap_torch.crowd_signs.complete_tracks import (
@@ -29,8 +30,7 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     CompletedTracks,
     associate_detections,
     associated_once,
-    complete_tracks,
-    with_evidence,
+    completed_signs,
 )
 from crowdmap_torch.crowd_signs.duplicates import may_be_one
 from crowdmap_torch.crowd_signs.gather import gather_signs
@@ -191,11 +191,9 @@ def map_journeys(
     if engine is None or any(journeys[number].t_ns.is_cuda for number in left[:1]):
         engine = InProcess()
     tracked = tracklets or {}
+    drives = journeys if stored is None or engine.shares_memory else stored
     calls: list[Call] = [
-        (journeys[n].journey_id, map_journey, (journeys[n], n, config, tracked.get(n)))
-        if stored is None or engine.shares_memory
-        else (journeys[n].journey_id, map_stored, (stored[n], n, config, tracked.get(n)))
-        for n in left
+        (journeys[n].journey_id, map_journey, (drives[n], n, config, tracked.get(n))) for n in left
     ]
     for place, made in engine.each(calls):
         number = left[place]
@@ -205,23 +203,19 @@ def map_journeys(
     return tuple(maps[number] for number in range(total))
 
 
-def map_stored(
-    drive: StoredDrive, number: int, config: MapperConfig, tracklets: Tracklets | None = None
-) -> JourneyMap:
-    """Section IV of a journey that is read where the work is done."""
-    return map_journey(drive.read(), number, config, tracklets)
-
-
 @one_core_each()
 @torch.no_grad()
 def map_journey(
-    journey: Journey, number: int, config: MapperConfig, tracklets: Tracklets | None = None
+    drive: Journey | StoredDrive,
+    number: int,
+    config: MapperConfig,
+    tracklets: Tracklets | None = None,
 ) -> JourneyMap:
-    """Section IV: the signs and lanes of one journey, the `number`-th of the dataset.
+    """Section IV: the signs and lanes of one journey, the `number`-th of the dataset; one that is stored is read here.
 
     `tracklets` are what `associate_signs` gives, where that is known already.
     """
-    config = config.resolved()
+    journey, config = drive.read() if isinstance(drive, StoredDrive) else drive, config.resolved()
     if tracklets is None:
         tracklets = associate_signs(journey, config.positioning, config.sign_association)
     signs, sign_report = triangulate_signs(
@@ -362,28 +356,35 @@ def made_anew(
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
     """What the adjustment begins again with: where it was, and without what turned out to be one; None: nothing did.
 
-    With it the covariances, if they had to be known for that.
+    Markers that are there twice are joined anew. With it the covariances, if they had to be known for that.
     """
-    rules = config.duplicate_signs
+    rules, trusted = config.duplicate_signs, first.crowd.trusted_frames(journeys)
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
-    is_last = first.completed is None or first.anew >= rules.rounds
-    if is_last or not len(may_be_one(signs, journeys, first.associations, rules)):
+    if first.completed is None or first.anew >= rules.rounds:
         return None, None
-    known = map_uncertainty(bundle, first.signs, first.lanes, engine)
-    signs = replace(signs, covariance=known.of_their_own)
-    found = associated_once(
-        *(journeys, poses := adjust.read_poses(bundle, journeys), [m.sign_tracklets for m in maps]),
-        AssociatedSigns(signs, first.tentative, first.associations, first.completed),
-        *(rules, config.complete_tracks),
-        trusted=first.crowd.journey_weight > 0,
-    )
-    return found and replace(
+    poses, made = adjust.read_poses(bundle, journeys), [m.lanes for m in maps]
+    drifts = tuple(map(se3.local, (j.T_world_camera for j in journeys), poses))
+    markers = lanes, made, drifts, trusted, first.crowd.positioning
+    joined, once, known = joined_anew(*markers, config.lane_join), None, None
+    if len(may_be_one(signs, journeys, first.associations, rules)):
+        known = map_uncertainty(bundle, first.signs, first.lanes, engine)
+        signs = replace(signs, covariance=known.of_their_own)
+    found = AssociatedSigns(signs, first.tentative, first.associations, first.completed)
+    if known is not None:
+        given = journeys, poses, [m.sign_tracklets for m in maps], found
+        sound = first.crowd.journey_weight > 0
+        once = associated_once(*given, rules, config.complete_tracks, trusted=sound)
+    if joined is None and once is None:
+        return None, known
+    found = once or found
+    return replace(
         first,
         signs=found.heads,
-        lanes=lanes,
+        lanes=joined.lanes if joined else lanes,
+        lane_support=joined.support if joined else first.lane_support,
         tentative=found.tentative,
         associations=found.associations,
-        drifts=tuple(map(se3.local, (j.T_world_camera for j in journeys), poses)),
+        drifts=drifts,
         completed=found.completed,
         anew=first.anew + 1,
         joined=first.joined + len(signs) - len(found.heads),
@@ -415,10 +416,10 @@ def finish_map(
     associations = first.associations
     if first.completed is not None:
         # Once more with the adjusted poses: what the first projections were too far off for.
-        rules, made = config.complete_tracks, [m.sign_tracklets for m in maps]
-        again = complete_tracks(journeys, poses, made, signs, associations, rules)
-        associations, trusted = again.associations, first.crowd.journey_weight > 0
-        signs = with_evidence(signs, journeys, associations, trusted, rules)
+        given = journeys, poses, [m.sign_tracklets for m in maps]
+        rules, trusted = config.complete_tracks, first.crowd.journey_weight > 0
+        signs, again = completed_signs(*given, signs, associations, rules, trusted=trusted)
+        associations = again.associations
     roads, gate = [m.road for m in maps], config.adjust.lane_gate_m
     associations = with_lanes(associations, journeys, roads, poses, lanes, gate=gate)
     provenance = {"config": config_hash(config), "journeys": [j.journey_id for j in journeys]}

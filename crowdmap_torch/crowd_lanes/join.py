@@ -83,6 +83,9 @@ class LaneJoinConfig(Settings):
     """... this share of its journeys saw both at once."""
     least_often: Share = 0.2
     """Markers are detected at least this often, as a share of what is usual where the same drives see markers."""
+    anew_from: Share = 0.02
+    """Where so much of an adjusted map's lanes is there twice, pieces are joined anew by adjusted poses, unless half of that
+    would stay, and the adjustment begins again (`duplicate_signs: {rounds: ...}` times at most)."""
     trace: TraceConfig = field(default_factory=TraceConfig)
     """What makes a marker."""
     lateral_offset: LateralOffsetConfig = field(default_factory=LateralOffsetConfig)

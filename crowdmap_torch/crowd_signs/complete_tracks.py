@@ -18,7 +18,7 @@ from crowdmap_torch.clustering.assignment import match_slots
 from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_count, rows_of_ranges
 from crowdmap_torch.clustering.neighbours import near_pairs
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, same_sign
-from crowdmap_torch.crowd_signs.existence import existence
+from crowdmap_torch.crowd_signs.existence import existence, still_alone
 from crowdmap_torch.crowd_signs.projections import (
     Candidates,
     ProjectionErrors,
@@ -126,10 +126,11 @@ def associate_detections(
     duplicate = duplicate_signs(journeys, poses, crowd.heads, associations, completion)
     heads, passing = crowd.heads[~duplicate], crowd.report.n_passing[~duplicate]
     associations = without_signs(associations, duplicate)
-    completed = complete_tracks(journeys, poses, tracklets, heads, associations, completion)
-    associations = completed.associations
     trusted = crowd.journey_weight > 0
-    heads = with_evidence(heads, journeys, associations, trusted, completion)
+    heads, completed = completed_signs(
+        journeys, poses, tracklets, heads, associations, completion, trusted=trusted
+    )
+    associations = completed.associations
     sure = existence(heads.n_journeys, passing, config.existence)
     # What a bad drive alone saw, or one where its positions were off, is nothing to look for.
     sound = trusted[crowd.tentative.journey] & ~crowd.displaced[crowd.label < 0]
@@ -188,6 +189,22 @@ def complete_tracks(
         fitting += between - before
         displaced += int((association.sign >= 0).sum()) - between
     return CompletedTracks(tuple(found), fitting, displaced)
+
+
+def completed_signs(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    tracklets: Sequence[Tracklets],
+    signs: Signs,
+    associations: Sequence[Association],
+    config: CompleteTracksConfig,
+    *,
+    trusted: Bool[Tensor, " j"],
+) -> tuple[Signs, CompletedTracks]:
+    """The associations of `complete_tracks`, and the signs with their evidence by them, of `trusted` journeys."""
+    completed = complete_tracks(journeys, poses, tracklets, signs, associations, config)
+    signs = with_evidence(signs, journeys, completed.associations, trusted, config)
+    return signs, completed
 
 
 def duplicate_signs(
@@ -250,12 +267,10 @@ def associated_once(
     joined = join_duplicates(before.heads, journeys, before.associations, config)
     if joined is None:
         return None
-    heads, associations = joined
-    completed = complete_tracks(journeys, poses, tracklets, heads, associations, completion)
-    associations = completed.associations
-    heads = with_evidence(heads, journeys, associations, trusted, completion)
-    alone = still_alone(before.tentative, tracklets, associations)
-    return AssociatedSigns(heads, before.tentative[alone], associations, completed)
+    given = journeys, poses, tracklets
+    heads, completed = completed_signs(*given, *joined, completion, trusted=trusted)
+    alone = still_alone(before.tentative, tracklets, completed.associations)
+    return AssociatedSigns(heads, before.tentative[alone], completed.associations, completed)
 
 
 def join_duplicates(
@@ -326,20 +341,6 @@ def with_evidence(
         first_seen_ns=signs.first_seen_ns.scatter_reduce(0, label, t_ns, "amin"),
         last_seen_ns=signs.last_seen_ns.scatter_reduce(0, label, t_ns, "amax"),
     )
-
-
-def still_alone(
-    singles: Signs, tracklets: Sequence[Tracklets], associations: Sequence[Association]
-) -> Bool[Tensor, " n"]:
-    """True for the signs of single journeys of whose detections less than half show a sign of the map."""
-    alone = torch.ones(len(singles), dtype=torch.bool, device=singles.shape.device)
-    for number in singles.journey.unique().tolist():
-        label, count = tracklets[number].label, tracklets[number].count
-        shown = group_count(label.masked_fill(associations[number].sign < 0, -1), count)
-        rows = torch.nonzero(singles.journey == number)[:, 0]
-        own = singles.tracklet[rows]
-        alone[rows] = 2 * shown[own] < group_count(label, count)[own]
-    return alone
 
 
 def _with_fitting(

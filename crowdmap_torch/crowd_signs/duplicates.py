@@ -17,7 +17,7 @@ from crowdmap_torch.clustering.groups import distinct_pairs, group_argmin, group
 from crowdmap_torch.clustering.neighbours import near_pairs
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance, sign_distance
 from crowdmap_torch.crowd_signs.merge import mutual_partners
-from crowdmap_torch.ranges import Cost, Count, Length, Rounds, Settings, Share, Sigma
+from crowdmap_torch.ranges import Cost, Count, Length, RoundsOrNone, Settings, Share, Sigma
 from crowdmap_torch.tables import Association, Journey, Signs
 
 
@@ -25,7 +25,7 @@ from crowdmap_torch.tables import Association, Journey, Signs
 class DuplicateSignConfig(Settings):
     """When two signs of an adjusted map are one; costs are squared standard deviations."""
 
-    rounds: Rounds = 2
+    rounds: RoundsOrNone = 2
     """So many times at most the adjustment begins again with what was joined; 0: never."""
     merge_cost: Cost = 9.0
     """Signs of one shape whose codes do not contradict each other are one if they are closer than this, ..."""

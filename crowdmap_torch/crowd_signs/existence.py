@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import distinct_pairs, group_count, group_median, group_sum
 from crowdmap_torch.crowd_signs.gather import CrowdSigns
 from crowdmap_torch.ranges import Length, Settings, Share, Spacing
+from crowdmap_torch.tables import Association, Signs, Tracklets
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,20 @@ def existence(
     real = torch.lgamma(n + 1) + torch.lgamma(m - n + 1) - torch.lgamma(m + 2)
     false = n * np.log(config.false_rate) + (m - n) * np.log1p(-config.false_rate)
     return torch.sigmoid(real - false)
+
+
+def still_alone(
+    singles: Signs, tracklets: Sequence[Tracklets], associations: Sequence[Association]
+) -> Bool[Tensor, " n"]:
+    """True for the signs of single journeys of whose detections less than half show a sign of the map."""
+    alone = torch.ones(len(singles), dtype=torch.bool, device=singles.shape.device)
+    for number in singles.journey.unique().tolist():
+        label, count = tracklets[number].label, tracklets[number].count
+        shown = group_count(label.masked_fill(associations[number].sign < 0, -1), count)
+        rows = torch.nonzero(singles.journey == number)[:, 0]
+        own = singles.tracklet[rows]
+        alone[rows] = 2 * shown[own] < group_count(label, count)[own]
+    return alone
 
 
 def passing_journeys(

@@ -96,6 +96,7 @@ def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict
         "sign detections brought back": first.completed.fitting + first.completed.displaced
         if first.completed
         else 0,
+        "adjustments begun again": first.anew,
         "signs joined after the adjustment": first.joined,
         "sign detections used": sum(int((a.sign >= 0).sum()) for a in result.associations),
         "lane detections used": sum(int((a.lane >= 0).sum()) for a in result.associations),

@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from worlds.split_signs import with_a_split_sign
+from worlds.split_landmarks import with_a_split_sign, with_split_lanes
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.footing import footing_of
 from crowdmap_torch.config import MapperConfig
+from crowdmap_torch.crowd_lanes.joined_anew import share_twice
+from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.mapper import FirstMap, MapResult, adjusted_map, build_bundle
 from crowdmap_torch.noise.positioning import PositioningNoise
@@ -126,3 +128,19 @@ def test_a_sign_that_was_taken_for_two_is_one_in_the_end(tiny, tiny_result: MapR
     here, there = (of.hd_map.signs.center_world for of in (found, tiny_result))
     assert len(here) == len(there)
     assert float(torch.cdist(there, here).amin(1).max()) < 0.05
+
+
+def test_markers_that_were_taken_for_two_are_one_in_the_end(tiny, tiny_result: MapResult):
+    split = with_split_lanes(tiny_result.first)
+    within = MapperConfig().lane_join.twice_within_m
+    kept = replace(MapperConfig(), duplicate_signs=DuplicateSignConfig(rounds=0))
+    twice = adjusted_map(tiny, tiny_result.journey_maps, split, kept).hd_map.lanes
+    found = adjusted_map(tiny, tiny_result.journey_maps, split, MapperConfig())
+    # The adjustment brings them to one place, and there they are one.
+    assert share_twice(twice, within) > 0.5
+    assert found.first.anew == 1 and found.first.joined == 0
+    lanes = found.hd_map.lanes
+    assert share_twice(lanes, within) == 0 and len(lanes) == len(tiny_result.hd_map.lanes)
+    # Each has what all drives saw of it, and the map of the clusters is that of before.
+    assert torch.equal(lanes.n_journeys, tiny_result.hd_map.lanes.n_journeys)
+    assert len(found.map_clusters.lanes) == len(twice)

@@ -19,7 +19,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from worlds.runs import ROUGH, Said, journeys_of
-from worlds.split_signs import with_a_split_sign
+from worlds.split_landmarks import with_a_split_sign
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust

@@ -28,10 +28,10 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     CompleteTracksConfig,
     complete_tracks,
     duplicate_signs,
-    still_alone,
     with_evidence,
     without_signs,
 )
+from crowdmap_torch.crowd_signs.existence import still_alone
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.tables import Association, Tracklets
 
