@@ -19,7 +19,7 @@ from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.crowd_lanes.cluster import LaneClusterConfig
 from crowdmap_torch.crowd_lanes.join import LaneJoinConfig
-from crowdmap_torch.crowd_signs.complete_tracks import CompleteTracksConfig
+from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig
 from crowdmap_torch.crowd_signs.register import CrowdConfig
 from crowdmap_torch.io.budget import ReadingBudget

@@ -15,71 +15,24 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.assignment import match_slots
-from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_count, rows_of_ranges
-from crowdmap_torch.clustering.neighbours import near_pairs
-from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, same_sign
+from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_count
+from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
+from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, duplicate_signs, same_sign
 from crowdmap_torch.crowd_signs.existence import existence, still_alone
 from crowdmap_torch.crowd_signs.projections import (
     Candidates,
     ProjectionErrors,
     box,
     candidates_nearby,
-    candidates_of,
     misfit_px,
     projection_errors,
 )
 from crowdmap_torch.crowd_signs.register import Crowd, CrowdConfig
 from crowdmap_torch.geometry import polygon
-from crowdmap_torch.ranges import (
-    Count,
-    Factor,
-    Length,
-    LengthOrNone,
-    Pixels,
-    Rounds,
-    Seconds,
-    Settings,
-    Share,
-)
-from crowdmap_torch.tables import Association, Journey, Signs, Tracklets
+from crowdmap_torch.tables import Association, Journey, Signs, Tracklets, concatenate
 
 _USUAL = 2.0
 """Hardly any detection is farther off its sign than so many times what half of them are."""
-
-
-@dataclass(frozen=True)
-class CompleteTracksConfig(Settings):
-    """When a detection without a landmark shows a sign of the map."""
-
-    reach_m: LengthOrNone = 120.0
-    """Signs further from the camera are not looked for [m]."""
-    candidates: Count = 48
-    """Signs that a detection is compared with, the nearest to its camera."""
-    error_window_s: Seconds = 1.0
-    """For so long before and after, a detection of a sign tells how its projection errs [s]."""
-    known_px: Pixels = 3.0
-    """Where that is known, most corners are within so many pixels, or within twice what is usual of the drive, ..."""
-    known_share: Share = 0.1
-    """... and this share of the outline's larger side of the projection."""
-    vote_share: Share = 0.35
-    """Where it is not, most corners are within this share, ..."""
-    vote_clear: Factor = 2.0
-    """... other signs so many times as far, ..."""
-    vote_majority: Share = 0.6
-    """... and so is this share of the detections of the tracklet, ..."""
-    vote_detections: Count = 1
-    """... which has at least so many."""
-    displaced_px: Pixels = 45.0
-    """An outline this far off may be the only one missing in its frame of a sign that is seen before and after, ..."""
-    displaced_size: Share = 0.2
-    """... if its sides differ by no more than this share."""
-    duplicate_m: Length = 1.5
-    """A sign this close to one that more journeys saw is a duplicate, if `vote_majority` of its detections lie on the
-    other's projection and nothing else in their frames shows the other [m]."""
-    passes: Rounds = 2
-    """What was found tells how the projections of other detections err."""
-    evidence: Count = 3
-    """Journeys with so many detections of a sign have seen it."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +68,8 @@ def associate_detections(
 ) -> AssociatedSigns:
     """The cluster heads with the detections of their members and, with `joint`, what else shows them in the images.
 
-    `poses` are the journeys' with the biases of the crowd taken off. A head that is another one badly placed goes.
+    `poses` are the journeys' with the biases of the crowd taken off. A head that is another one badly placed goes, a sign of
+    one journey that others see too becomes one.
     """
     associations = tuple(
         member_association(journey, made, crowd, number)
@@ -124,20 +78,86 @@ def associate_detections(
     if config.method == "paper2017":
         return AssociatedSigns(crowd.heads, crowd.tentative, associations, None)
     duplicate = duplicate_signs(journeys, poses, crowd.heads, associations, completion)
-    heads, passing = crowd.heads[~duplicate], crowd.report.n_passing[~duplicate]
+    of_heads, of_singles = crowd.report.n_passing.split([len(crowd.heads), len(crowd.tentative)])
+    heads = crowd.heads[~duplicate]
     associations = without_signs(associations, duplicate)
     trusted = crowd.journey_weight > 0
     heads, completed = completed_signs(
         journeys, poses, tracklets, heads, associations, completion, trusted=trusted
     )
     associations = completed.associations
-    sure = existence(heads.n_journeys, passing, config.existence)
+    sure = existence(heads.n_journeys, of_heads[~duplicate], config.existence)
     # What a bad drive alone saw, or one where its positions were off, is nothing to look for.
     sound = trusted[crowd.tentative.journey] & ~crowd.displaced[crowd.label < 0]
-    tentative = crowd.tentative[sound]
-    tentative = tentative[still_alone(tentative, tracklets, associations)]
+    tentative, passing = crowd.tentative[sound], of_singles[sound]
+    alone = still_alone(tentative, tracklets, associations)
     heads = replace(heads, confidence=sure.to(heads.size))
-    return AssociatedSigns(heads, tentative, associations, completed)
+    found = AssociatedSigns(heads, tentative[alone], associations, completed)
+    given = journeys, poses, tracklets
+    return with_vouched(*given, found, passing[alone], config, completion, trusted=trusted)
+
+
+def with_vouched(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    tracklets: Sequence[Tracklets],
+    found: AssociatedSigns,
+    passing: Int[Tensor, " n"],
+    config: CrowdConfig,
+    completion: CompleteTracksConfig,
+    *,
+    trusted: Bool[Tensor, " j"],
+) -> AssociatedSigns:
+    """The same with those tentative signs among the heads that detections of other drives lie on, `passing` drives by each.
+
+    Who sees a sign from afar alone, or for a moment, makes no sign of it, but tells whether there is one where another
+    drive has it.
+    """
+    heads, singles = found.heads, found.tentative
+    every, n = concatenate([heads, singles]), len(heads)
+    shown = tuple(
+        _with_fitting(
+            journey, pose, made, every, _with_singles(seen, made, singles, n, number), completion
+        )
+        for number, (journey, pose, made, seen) in enumerate(
+            zip(journeys, poses, tracklets, found.associations, strict=True)
+        )
+    )
+    every = with_evidence(every, journeys, shown, trusted, completion)
+    is_head = torch.arange(len(every), device=trusted.device) < n
+    kept = is_head | (every.n_journeys >= config.min_journeys)
+    vouched = kept[n:]
+    if not bool(vouched.any()):
+        return found
+    sure = existence(every.n_journeys[n:], passing, config.existence).to(heads.size)
+    every = replace(every, confidence=torch.cat((heads.confidence, sure)))
+    associations = without_signs(shown, ~kept)
+    left = singles[~vouched]
+    left = left[still_alone(left, tracklets, associations)]
+    assert found.completed is not None
+    more = sum(int((a.sign >= 0).sum()) for a in associations)
+    more -= sum(int((a.sign >= 0).sum()) for a in found.associations)
+    completed = replace(
+        found.completed, associations=associations, fitting=found.completed.fitting + more
+    )
+    return AssociatedSigns(every[kept], left, associations, completed)
+
+
+def _with_singles(
+    association: Association, tracklets: Tracklets, singles: Signs, first: int, number: int
+) -> Association:
+    """The association of the `number`-th journey in which its single signs, rows from `first` on, have their tracklets."""
+    mine = torch.nonzero(singles.journey == number)[:, 0]
+    row = torch.full((tracklets.count + 1,), -1, device=mine.device)
+    row[singles.tracklet[mine]] = first + mine
+    own = row[tracklets.label]  # label -1 reads the last slot, which stays -1
+    fresh = (association.sign < 0) & (own >= 0)
+    assert tracklets.shift is not None
+    return replace(
+        association,
+        sign=torch.where(fresh, own, association.sign),
+        sign_shift=torch.where(fresh, tracklets.shift, association.sign_shift),
+    )
 
 
 def member_association(
@@ -205,49 +225,6 @@ def completed_signs(
     completed = complete_tracks(journeys, poses, tracklets, signs, associations, config)
     signs = with_evidence(signs, journeys, completed.associations, trusted, config)
     return signs, completed
-
-
-def duplicate_signs(
-    journeys: Sequence[Journey],
-    poses: Sequence[Float[Tensor, "_ 4 4"]],
-    signs: Signs,
-    associations: Sequence[Association],
-    config: CompleteTracksConfig,
-) -> Bool[Tensor, " n"]:
-    """True for signs that are another one badly placed, by what their detections show.
-
-    A few frames from afar leave open which way a plate faces; two clusters of it are then far from each other in all
-    that clustering compares, yet they look the same in every image.
-    """
-    n = len(signs)
-    near = near_pairs(signs.center_world, radius=config.duplicate_m, count=config.candidates)
-    pair = torch.cat((near, near.flip(1)))
-    weaker, stronger = pair[signs.n_journeys[pair[:, 0]] <= signs.n_journeys[pair[:, 1]]].T
-    order = weaker.argsort(stable=True)
-    stronger = stronger[order]
-    partners = group_count(weaker, n)
-    start = partners.cumsum(0) - partners
-    fits, total = [], torch.zeros_like(partners)
-    for journey, pose, association in zip(journeys, poses, associations, strict=True):
-        total = total + group_count(association.sign, n)
-        rows = torch.nonzero(association.sign >= 0)[:, 0]
-        shown = association.sign[rows]
-        at, other = rows_of_ranges(start[shown], partners[shown])
-        pairs = candidates_of(journey, pose, signs, rows[at], stronger[other])
-        error = projection_errors(
-            journey, pose, signs, association, pairs, window_s=config.error_window_s
-        )
-        misfit, _ = misfit_px(journey.signs, signs, pairs, error.offset_px)
-        inside = (misfit < config.vote_share * pairs.size) & ~error.is_shown
-        fits.append(torch.stack((association.sign[pairs.row], pairs.sign), dim=1)[inside])
-    weaker, stronger, number = distinct_pairs(*torch.cat(fits).T)
-    alike = number >= config.vote_majority * total[weaker]
-    weaker, stronger = weaker[alike], stronger[alike]
-    # Of two that are duplicates of each other the first stays.
-    is_first = (signs.n_journeys[weaker] == signs.n_journeys[stronger]) & (weaker < stronger)
-    duplicate = torch.zeros(n, dtype=torch.bool, device=weaker.device)
-    duplicate[weaker[~is_first]] = True
-    return duplicate
 
 
 def associated_once(

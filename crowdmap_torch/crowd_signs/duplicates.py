@@ -1,4 +1,4 @@
-"""V-B, unlike the paper: which signs of an adjusted map are one.
+"""Unlike the paper: which signs are one, among cluster heads (V-A.1) and in an adjusted map (V-B).
 
 Where rotations are off, one sign's triangulations by different drives lie metres apart, too far for one cluster. The
 adjustment, which sees all rays at once, brings them to one place.
@@ -10,13 +10,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import distinct_pairs, group_argmin, group_count, pairs_within
+from crowdmap_torch.clustering.groups import (
+    distinct_pairs,
+    group_argmin,
+    group_count,
+    pairs_within,
+    rows_of_ranges,
+)
 from crowdmap_torch.clustering.neighbours import near_pairs
+from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance, sign_distance
 from crowdmap_torch.crowd_signs.merge import mutual_partners
+from crowdmap_torch.crowd_signs.projections import candidates_of, misfit_px, projection_errors
 from crowdmap_torch.ranges import Cost, Count, Length, RoundsOrNone, Settings, Share, Sigma
 from crowdmap_torch.tables import Association, Journey, Signs
 
@@ -40,6 +48,49 @@ class DuplicateSignConfig(Settings):
     """Signs that a sign is compared with, the nearest."""
     similarity: SimilarityConfig = field(default_factory=SimilarityConfig)
     """What differences of appearance cost."""
+
+
+def duplicate_signs(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    signs: Signs,
+    associations: Sequence[Association],
+    config: CompleteTracksConfig,
+) -> Bool[Tensor, " n"]:
+    """True for signs that are another one badly placed, by what their detections show.
+
+    A few frames from afar leave open which way a plate faces; two clusters of it are then far from each other in all
+    that clustering compares, yet they look the same in every image.
+    """
+    n = len(signs)
+    near = near_pairs(signs.center_world, radius=config.duplicate_m, count=config.candidates)
+    pair = torch.cat((near, near.flip(1)))
+    weaker, stronger = pair[signs.n_journeys[pair[:, 0]] <= signs.n_journeys[pair[:, 1]]].T
+    order = weaker.argsort(stable=True)
+    stronger = stronger[order]
+    partners = group_count(weaker, n)
+    start = partners.cumsum(0) - partners
+    fits, total = [], torch.zeros_like(partners)
+    for journey, pose, association in zip(journeys, poses, associations, strict=True):
+        total = total + group_count(association.sign, n)
+        rows = torch.nonzero(association.sign >= 0)[:, 0]
+        shown = association.sign[rows]
+        at, other = rows_of_ranges(start[shown], partners[shown])
+        pairs = candidates_of(journey, pose, signs, rows[at], stronger[other])
+        error = projection_errors(
+            journey, pose, signs, association, pairs, window_s=config.error_window_s
+        )
+        misfit, _ = misfit_px(journey.signs, signs, pairs, error.offset_px)
+        inside = (misfit < config.vote_share * pairs.size) & ~error.is_shown
+        fits.append(torch.stack((association.sign[pairs.row], pairs.sign), dim=1)[inside])
+    weaker, stronger, number = distinct_pairs(*torch.cat(fits).T)
+    alike = number >= config.vote_majority * total[weaker]
+    weaker, stronger = weaker[alike], stronger[alike]
+    # Of two that are duplicates of each other the first stays.
+    is_first = (signs.n_journeys[weaker] == signs.n_journeys[stronger]) & (weaker < stronger)
+    duplicate = torch.zeros(n, dtype=torch.bool, device=weaker.device)
+    duplicate[weaker[~is_first]] = True
+    return duplicate
 
 
 def may_be_one(

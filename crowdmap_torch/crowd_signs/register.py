@@ -133,7 +133,7 @@ class CrowdReport:
     outages: tuple[Outage, ...]
     """Stretches of drives that do not fit it."""
     n_passing: Int[Tensor, " c"]
-    """Journeys that passed by each sign."""
+    """Journeys that passed by each head, and behind the heads by each single."""
 
 
 @dataclass(frozen=True)
@@ -414,10 +414,13 @@ def _finished(
     outages: tuple[Outage, ...] = (),
     displaced: Bool[Tensor, " n"] | None = None,
 ) -> Crowd:
-    passing = passing_journeys(crowd, label, len(heads), config.existence)
-    confidence = existence(heads.n_journeys, passing, config.existence).to(heads.size)
+    is_single = label < 0
+    every = torch.where(is_single, len(heads) - 1 + is_single.cumsum(0), label)
+    count = len(heads) + int(is_single.sum())
+    passing = passing_journeys(crowd, every, count, config.existence)
+    confidence = existence(heads.n_journeys, passing[: len(heads)], config.existence)
     members = unbiased_signs(crowd, bias)
-    tentative = members[label < 0]
+    tentative = members[is_single]
     drift = positioning.drift_sigma_m**2 * torch.eye(3).to(tentative.covariance)
     of_bias = bias.covariance[tentative.journey] + bias.shared_covariance + drift
     tentative = with_covariance(tentative, of_bias)
@@ -425,7 +428,7 @@ def _finished(
     return Crowd(
         members=members,
         label=label,
-        heads=replace(heads, confidence=confidence),
+        heads=replace(heads, confidence=confidence.to(heads.size)),
         tentative=replace(tentative, confidence=torch.minimum(low, tentative.confidence)),
         bias=bias,
         positioning=positioning,

@@ -25,13 +25,17 @@ from worlds.sign_drive import (
 )
 
 from crowdmap_torch.crowd_signs.complete_tracks import (
-    CompleteTracksConfig,
+    AssociatedSigns,
+    CompletedTracks,
     complete_tracks,
-    duplicate_signs,
     with_evidence,
+    with_vouched,
     without_signs,
 )
+from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
+from crowdmap_torch.crowd_signs.duplicates import duplicate_signs
 from crowdmap_torch.crowd_signs.existence import still_alone
+from crowdmap_torch.crowd_signs.register import CrowdConfig
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.tables import Association, Tracklets
 
@@ -249,3 +253,63 @@ def test_singles_are_alone_until_most_of_their_detections_are_somewhere(drive: S
         known[views[: round(share * len(views))]] = True
         found = still_alone(singles, [tracklets_of(drive.sign)], [associated(drive, known)])
         assert found.tolist() == alone
+
+
+def one_of_two(
+    drive: SignDrive, second: Tensor, *, off_m: float = 0.0, trusted=(True, True), passing: int = 2
+) -> tuple[AssociatedSigns, AssociatedSigns]:
+    """Two drives, and signs of which the last is one that the first drive alone made: with it vouched for, if it is.
+
+    `second`: which sign each detection of the second drive shows, -2: it has no such detection.
+    """
+    signs = map_of(drive)
+    T = signs.T_world_sign.clone()
+    T[2, 0, 3] += off_m
+    signs = replace(signs, T_world_sign=T, journey=torch.full((3,), -1))
+    single = replace(
+        signs[torch.tensor([2])], journey=torch.tensor([0]), tracklet=torch.tensor([2])
+    )
+    other = with_rows(drive, torch.nonzero(second >= -1)[:, 0])
+    journeys = [drive.journey, other.journey]
+    poses = [journey.T_world_camera for journey in journeys]
+    known = [associated(one, one.sign < 2) for one in (drive, other)]
+    made = [replace(tracklets_of(one.sign), shift=shift_of(one)) for one in (drive, other)]
+    none = CompletedTracks(tuple(known), 0, 0)
+    found = AssociatedSigns(signs[torch.tensor([0, 1])], single, tuple(known), none)
+    return found, with_vouched(
+        *(journeys, poses, made, found, torch.tensor([passing]), CrowdConfig(), CONFIG),
+        trusted=torch.tensor(trusted),
+    )
+
+
+def test_a_sign_of_one_drive_is_one_of_the_map_if_another_drive_sees_it_there(drive: SignDrive):
+    found, vouched = one_of_two(drive, drive.sign)
+    assert len(vouched.heads) == 3 and len(vouched.tentative) == 0
+    assert int(vouched.heads.n_journeys[2]) == 2 and float(vouched.heads.confidence[2]) > 0.99
+    for association in vouched.associations:
+        shown = association.sign[drive.sign == 2]
+        assert bool((shown == 2).double().mean() > 0.9)
+        rows = association.sign >= 0
+        assert torch.equal(association.sign[rows], drive.sign[rows])
+    assert found.completed is not None and vouched.completed is not None
+    assert vouched.completed.fitting > found.completed.fitting
+    # The second drive's corners are counted as the sign's are.
+    shift = vouched.associations[1].sign_shift[drive.sign == 2]
+    assert torch.equal(shift, shift_of(drive)[drive.sign == 2])
+
+
+def test_a_sign_that_few_of_those_who_passed_saw_is_less_sure(drive: SignDrive):
+    _, by_two = one_of_two(drive, drive.sign)
+    _, by_many = one_of_two(drive, drive.sign, passing=40)
+    assert float(by_many.heads.confidence[2]) < float(by_two.heads.confidence[2]) - 0.2
+
+
+@pytest.mark.parametrize("fault", ["a glance", "elsewhere", "a bad drive"])
+def test_a_sign_that_nobody_else_sees_stays_one_drives_own(drive: SignDrive, fault: str):
+    second = drive.sign.clone()
+    if fault == "a glance":
+        second[torch.nonzero(drive.sign == 2)[CONFIG.evidence - 1 :, 0]] = -2
+    off_m = 3.0 if fault == "elsewhere" else 0.0
+    trusted = (True, fault != "a bad drive")
+    found, vouched = one_of_two(drive, second, off_m=off_m, trusted=trusted)
+    assert vouched is found
