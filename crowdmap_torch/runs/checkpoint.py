@@ -235,12 +235,17 @@ def inputs_of(
         "crowdmap": __version__,
         "torch": torch.__version__,
         "device": device.type,
-        "configuration": as_dict(config),
+        "configuration": _written(config),
         "dataset": {"origin": digest(dataset.origin), "types": digest(dataset.type_names)},
         "journey": {journey.journey_id: digest(journey) for journey in dataset.journeys},
         **({} if dataset.bbox is None else {"bbox": [*dataset.bbox]}),
         **{name: digest(table) for name, table in beside.items() if table is not None},
     }
+
+
+def _written(config: MapperConfig) -> dict[str, Any]:
+    """The configuration as JSON can have it: numbers without end, which switch terms off, as YAML spells them."""
+    return json.loads(json.dumps(as_dict(config)), parse_constant=lambda _: ".inf")
 
 
 def _of_journey(number: int) -> str:

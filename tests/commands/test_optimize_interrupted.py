@@ -319,6 +319,18 @@ def test_a_run_whose_adjustment_began_again_goes_on_to_the_same_bits(
     assert same_map(out, whole)
 
 
+def test_a_term_that_is_switched_off_is_off_in_what_is_resumed(
+    optimize, small: Path, tmp_path: Path
+):
+    off, out = tmp_path / "off.yaml", tmp_path / "run"
+    off.write_text("adjust: {lane_height_sigma_m: .inf}\n")
+    assert optimize(small, out, "--config", str(off)).code == 0
+    said = optimize(small, out, "--config", str(off), "--resume")
+    assert said.code == 0 and "finished already" in said.out
+    said = optimize(small, out, "--resume")
+    assert said.code == 2 and "adjust.lane_height_sigma_m was .inf, is 0.05" in said.err
+
+
 def test_a_damaged_stage_is_made_anew(optimize, cuts: Cuts, small: Path, tmp_path: Path, run: Path):
     out = tmp_path / "run"
     cuts.cut = ("finish_map", 0)
