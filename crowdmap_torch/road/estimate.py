@@ -42,6 +42,7 @@ from crowdmap_torch.road.measurements import (
     MeasurementState,
     first_measurement_state,
     lane_rays,
+    softer_springs,
     take_measurements,
     width_moments,
 )
@@ -49,6 +50,10 @@ from crowdmap_torch.road.surface import flattened_rays, lay_surface
 from crowdmap_torch.road.vanishing_point import LaneRays, VanishingFit, fit_vanishing
 from crowdmap_torch.tables import Journey, Rig, RoadEstimate, concatenate
 
+_LOOKS = 5
+"""What a drive shows of its springs is known after two or three."""
+_NODS = 3.0
+"""Springs hardly go further than so many of their sigmas."""
 METHODS = ("smoothed", "causal", "paper2017", "calibration")
 
 
@@ -60,7 +65,8 @@ class RoadConfig(Settings):
     """`smoothed`: all measurements, all frames; `causal`: past frames only; `paper2017`: eq:rne on past frames;
     `calibration`: no adjustment."""
     max_adjustment_deg: Degrees = 3.0
-    """Normals further from calibration than this are not admitted."""
+    """Normals further from calibration than this are not admitted; of a car that nods further than others (`softer_from`)
+    by as much further."""
     refinements: RoundsOrNone = 1
     """How often the markers are looked at again on the curved road found so far; method
     `smoothed`."""
@@ -91,7 +97,7 @@ def estimate_road(
     rays = _rays(journey, motion)
     fit = _fit(rays, torch.zeros_like(motion.alpha), journey.rig, config)
     moments = width_moments(fit, rays, journey.rig.camera_height, config.measurements)
-    state = _smoothed(motion, fit, moments, positioning, config)
+    state, springs = _smoothed(motion, fit, moments, positioning, config)
     for _ in range(config.refinements):
         alpha, beta = motion.alpha + state.mean[:, SLOPE], motion.beta + state.mean[:, CROSS]
         height = torch.full_like(alpha, journey.rig.camera_height)
@@ -108,8 +114,10 @@ def estimate_road(
             by_twist=torch.zeros_like(fit.by_twist),
         )
         moments = width_moments(fit, flat, journey.rig.camera_height, config.measurements, beta)
-        state = _smoothed(motion, fit, moments, positioning, config)
-    return _estimate(motion, state, journey.rig, positioning, config)
+        state, springs = _smoothed(motion, fit, moments, positioning, config)
+    # Who nods by degrees is far from calibration.
+    nods = math.hypot(*springs) - math.hypot(*config.measurements.shaking)
+    return _estimate(motion, state, journey.rig, positioning, config, further=_NODS * nods)
 
 
 class RoadTracker:
@@ -234,23 +242,36 @@ def _smoothed(
     moments: Float[Tensor, "f 6"],
     positioning: PositioningNoise,
     config: RoadConfig,
-) -> RoadState:
+) -> tuple[RoadState, tuple[float, float]]:
+    """All frames by all measurements, with springs that are as soft as the drive shows, which go with them."""
     dt = torch.diff(motion.t_s, prepend=motion.t_s[:1])
-    measurements, _ = take_measurements(
-        motion, dt, fit, moments, first_measurement_state(motion), positioning, config.measurements
-    )
-    start = first_state(config.kalman, motion.alpha)
-    return smooth_backward(filter_forward(start, measurements, positioning, config.kalman))
+    start, begin = first_state(config.kalman, motion.alpha), first_measurement_state(motion)
+    trusted, looks = config.measurements, 0
+    while True:
+        given = motion, dt, fit, moments, begin, positioning, trusted
+        measurements, _ = take_measurements(*given)
+        state = smooth_backward(filter_forward(start, measurements, positioning, config.kalman))
+        pitch, roll = softer_springs(motion, dt, state, trusted, config.measurements)
+        looks += 1
+        if (pitch, roll) == trusted.shaking or looks == _LOOKS:
+            return state, trusted.shaking
+        trusted = replace(trusted, shaking=(pitch, roll))
 
 
 def _estimate(
-    motion: EgoMotion, state: RoadState, rig: Rig, positioning: PositioningNoise, config: RoadConfig
+    motion: EgoMotion,
+    state: RoadState,
+    rig: Rig,
+    positioning: PositioningNoise,
+    config: RoadConfig,
+    *,
+    further: float = 0.0,
 ) -> RoadEstimate:
-    """Normals of slopes; those too far from calibration are replaced by it."""
+    """Normals of slopes; those too far from calibration, and `further` [rad] than that, are replaced by it."""
     alpha, beta = motion.alpha + state.mean[:, SLOPE], motion.beta + state.mean[:, CROSS]
     variance = state.covariance[:, SLOPE, SLOPE] + state.covariance[:, CROSS, CROSS]
     sigma = (variance + 2 * positioning.white_sigma_rad**2).sqrt()
-    admitted = _is_admitted(alpha, beta, config)
+    admitted = _is_admitted(alpha, beta, config, further)
     alpha, beta = (torch.where(admitted, value, 0.0) for value in (alpha, beta))
     sigma = torch.where(admitted, sigma, math.hypot(*config.kalman.stance_sigma))
     return _road_table(motion, alpha, beta, sigma, rig)
@@ -276,8 +297,9 @@ def _calibrated(rig: Rig, frames: int, config: RoadConfig, like: Tensor) -> Road
     )
 
 
-def _is_admitted(alpha: Tensor, beta: Tensor, config: RoadConfig) -> Tensor:
-    return torch.hypot(alpha, beta) < math.tan(math.radians(config.max_adjustment_deg))
+def _is_admitted(alpha: Tensor, beta: Tensor, config: RoadConfig, further: float = 0.0) -> Tensor:
+    limit = math.tan(math.radians(config.max_adjustment_deg)) + further
+    return torch.hypot(alpha, beta) < limit
 
 
 def _latest_admitted(

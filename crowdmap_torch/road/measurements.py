@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.noise.positioning import PositioningNoise
-from crowdmap_torch.ranges import Duration, Length, Settings, Sigma, Span
+from crowdmap_torch.ranges import Duration, Factor, Length, Settings, Sigma, Span
 from crowdmap_torch.road.ego_motion import EgoMotion
 from crowdmap_torch.road.kalman import (
     CROSS,
@@ -24,8 +24,12 @@ from crowdmap_torch.road.kalman import (
     STATE_SIZE,
     TWIST,
     Measurements,
+    RoadState,
 )
 from crowdmap_torch.road.vanishing_point import LaneRays, VanishingConfig, VanishingFit
+
+_BRAKING_S = 2.0
+"""Cars brake and accelerate for about so long [s]."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,9 @@ class MeasurementConfig(Settings):
     """How far each kind of measurement can be trusted; pairs are (pitch, roll), angles in radians."""
 
     shaking: tuple[Sigma, Sigma] = (2.5e-3, 1.3e-3)
-    """1-sigma of the springs' pitch and roll."""
+    """1-sigma of the springs' pitch and roll; of a drive that shows more, what it shows (method `smoothed`)."""
+    softer_from: Factor = 1.5
+    """It shows more where that is so many times this."""
     shaking_memory_s: Duration = 0.2
     """Time after which the springs have forgotten it."""
     parallel_sigma: Sigma = 1.5e-3
@@ -83,8 +89,7 @@ def take_measurements(
     """The measurements of frames that follow on `so_far`, and what the frames after them need."""
     walked = so_far.station + motion.station
     station = torch.cummax(torch.cat((so_far.station[None], walked)), 0)[0]
-    # The springs shake with a memory: over many frames it averages out more slowly than white noise.
-    longer = (2 * config.shaking_memory_s / dt.clamp_min(1e-3)).clamp_min(1)
+    longer = _correlated(dt, config)
     chord, chord_start = _chords(motion, station, so_far.chord_start, config)
     width, widths = _widths(station, moments, so_far.widths, config)
     columns = (
@@ -189,6 +194,43 @@ def _passes(station: Float[Tensor, " stations"], every: float) -> Bool[Tensor, "
     """True for frames in which the way passes a multiple of a length."""
     index = (station / every).floor()
     return index[1:] > index[:-1]
+
+
+def softer_springs(
+    motion: EgoMotion,
+    dt: Float[Tensor, " f"],
+    state: RoadState,
+    trusted: MeasurementConfig,
+    config: MeasurementConfig,
+) -> tuple[float, float]:
+    """1-sigma of the springs' pitch and roll that a drive shows beside the `state` that was found with `trusted` ones.
+
+    Those that were `trusted`, where it shows hardly more. Means over some seconds tell: who brakes is nose-down for longer
+    than the springs shake, and what lasts is taken for a slope of the road if it is trusted like what does not.
+    """
+    longer = _correlated(dt, config).mean()
+    block = (motion.t_s / _BRAKING_S).floor().long()
+    number = torch.bincount(block).to(motion.t_s)
+
+    def shown(seen: Float[Tensor, " f"], slope: int, stance: int) -> Tensor:
+        left = seen - (state.mean[:, stance] - state.mean[:, slope])
+        total = torch.zeros_like(number).index_add(0, block, left)
+        enough = number >= 2
+        mean_sq = (total.square() / number.clamp_min(1) * enough).sum() / enough.sum().clamp_min(1)
+        return (mean_sq / longer).sqrt()
+
+    found = torch.stack((shown(motion.alpha, SLOPE, STANCE), shown(motion.beta, CROSS, ROLL)))
+    known = trusted.shaking
+    pitch, roll = (
+        new if new > config.softer_from * old else old
+        for new, old in zip(found.tolist(), known, strict=True)
+    )
+    return pitch, roll
+
+
+def _correlated(dt: Float[Tensor, " f"], config: MeasurementConfig) -> Float[Tensor, " f"]:
+    """So many times the variance: the springs shake with a memory, which averages out more slowly than white noise."""
+    return (2 * config.shaking_memory_s / dt.clamp_min(1e-3)).clamp_min(1)
 
 
 def width_moments(

@@ -19,6 +19,7 @@ from crowdmap_torch.geometry import se3
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.road.coplanarity import CoplanarityConfig
 from crowdmap_torch.road.estimate import METHODS, RoadConfig, RoadTracker, estimate_road
+from crowdmap_torch.road.measurements import MeasurementConfig
 from crowdmap_torch.simulate.vehicle import VehicleConfig
 
 F64 = torch.float64
@@ -34,10 +35,17 @@ def suburb(tmp_path_factory) -> SimulatedDrives:
     return simulate(tmp_path_factory.mktemp("road") / "suburb", "suburb", length_m=350.0, seed=3)
 
 
-def mean_error_deg(drives: SimulatedDrives, method: str) -> float:
+FIRM = MeasurementConfig(softer_from=1e3)
+"""No drive shows springs so soft."""
+
+
+def mean_error_deg(
+    drives: SimulatedDrives, method: str, measurements: MeasurementConfig | None = None
+) -> float:
+    config = RoadConfig(method=method, measurements=measurements or MeasurementConfig())
     errors = []
     for truth in drives.truths:
-        road = estimate_road(truth.journey, PositioningNoise(), RoadConfig(method=method))
+        road = estimate_road(truth.journey, PositioningNoise(), config)
         errors.append(angle_deg(road.normal_camera, truth.road_normal_camera))
     return torch.cat(errors).mean().item()
 
@@ -49,6 +57,25 @@ def test_normal_under_load_on_curved_roads(world: str, request: pytest.FixtureRe
     # Over long drives it is 0.15 degrees; 350 m leave the roll less time.
     assert mean_error_deg(drives, "smoothed") < min(0.2, calibrated / 2)
     assert mean_error_deg(drives, "causal") < min(0.3, calibrated / 1.5)
+
+
+@pytest.mark.parametrize(("world", "seed"), [("block", 0), ("block", 2), ("suburb", 1)])
+def test_cars_that_nod_as_they_brake_are_followed(tmp_path, world: str, seed: int) -> None:
+    nodding = VehicleConfig(squat_deg=1.5)
+    drives = simulate(tmp_path / world, world, length_m=350.0, seed=seed, vehicle=nodding)
+    # Trusted like others, a part of what braking does is taken for a slope of the road.
+    assert mean_error_deg(drives, "smoothed", FIRM) > 0.3
+    assert mean_error_deg(drives, "smoothed") < 0.2
+    test_sigma_says_how_wrong_the_normal_is(drives)
+
+
+def test_springs_as_usual_are_trusted_as_usual(hills: SimulatedDrives, suburb: SimulatedDrives):
+    for truth in (*hills.truths, *suburb.truths):
+        found, firm = (
+            estimate_road(truth.journey, PositioningNoise(), RoadConfig(measurements=how))
+            for how in (MeasurementConfig(), FIRM)
+        )
+        assert torch.equal(found.normal_camera, firm.normal_camera)
 
 
 def test_sigma_says_how_wrong_the_normal_is(hills: SimulatedDrives) -> None:
