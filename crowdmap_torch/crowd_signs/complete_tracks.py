@@ -115,13 +115,14 @@ def with_vouched(
     """
     heads, singles = found.heads, found.tentative
     every, n = concatenate([heads, singles]), len(heads)
+    drives = zip(journeys, poses, tracklets, found.associations, strict=True)
+    # What lies on no head was compared with all of them before.
     shown = tuple(
         _with_fitting(
-            journey, pose, made, every, _with_singles(seen, made, singles, n, number), completion
+            *(journey, pose, made, every, _with_singles(seen, made, singles, n, k), completion),
+            first=n,
         )
-        for number, (journey, pose, made, seen) in enumerate(
-            zip(journeys, poses, tracklets, found.associations, strict=True)
-        )
+        for k, (journey, pose, made, seen) in enumerate(drives)
     )
     every = with_evidence(every, journeys, shown, trusted, completion)
     is_head = torch.arange(len(every), device=trusted.device) < n
@@ -327,11 +328,12 @@ def _with_fitting(
     signs: Signs,
     association: Association,
     config: CompleteTracksConfig,
+    *,
+    first: int = 0,
 ) -> Association:
-    """The association with detections that lie on the projection of a sign."""
-    pairs = candidates_nearby(
-        journey, pose, signs, association, reach_m=config.reach_m, count=config.candidates
-    )
+    """The association with detections that lie on the projection of a sign, of those from the row `first` on."""
+    reach = {"reach_m": config.reach_m, "count": config.candidates, "first": first}
+    pairs = candidates_nearby(journey, pose, signs, association, **reach)
     for _ in range(config.passes):
         error = projection_errors(
             journey, pose, signs, association, pairs, window_s=config.error_window_s

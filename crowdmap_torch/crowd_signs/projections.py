@@ -68,12 +68,16 @@ def candidates_nearby(
     *,
     reach_m: float,
     count: int,
+    first: int = 0,
 ) -> Candidates:
-    """Detections that show no sign yet, each with the up to `count` nearest signs within reach of its camera."""
+    """Detections that show no sign yet, each with the up to `count` nearest signs within reach of its camera.
+
+    Of the signs those from the row `first` on.
+    """
     rows = torch.nonzero(association.sign < 0)[:, 0]
     position = pose[journey.signs.frame[rows], :3, 3]
-    at, sign = cross_pairs(position, signs.center_world, radius=reach_m, count=count).T
-    return candidates_of(journey, pose, signs, rows[at], sign)
+    at, sign = cross_pairs(position, signs.center_world[first:], radius=reach_m, count=count).T
+    return candidates_of(journey, pose, signs, rows[at], first + sign)
 
 
 def projection_errors(
