@@ -9,10 +9,10 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_range, group_sum, rows_of_ranges
 from crowdmap_torch.clustering.neighbours import pairs_in_radius
 from crowdmap_torch.crowd_lanes.line_samples import (
-    MAX_ANGLE_COS,
     LineSamples,
     along_axis,
     left_of_axis,
+    runs_along,
 )
 from crowdmap_torch.crowd_lanes.splines import Curves, Match, nearest_row
 
@@ -48,14 +48,9 @@ def covered_twice(
     pair = pairs_in_radius(curves.point[:, :2], (gate**2 + _ALONG**2) ** 0.5)
     pair = pair[curves.curve[pair[:, 0]] != curves.curve[pair[:, 1]]]
     i, j = torch.cat((pair, pair.flip(1))).T
-    axis = curves.direction[i]
+    axis, other = curves.direction[i], curves.direction[j]
     delta = curves.point[j] - curves.point[i]
-    fits = (
-        (left_of_axis(delta, axis).abs() < gate)
-        & (along_axis(delta, axis).abs() < _ALONG)
-        & (along_axis(curves.direction[j], axis).abs() > MAX_ANGLE_COS)
-        & (delta[:, 2].abs() < height_gate)
-    )
+    fits = runs_along(delta, axis, other, within=gate, along=_ALONG, height=height_gate)
     i, j = i[fits], j[fits]
     if not len(i):
         return dropped

@@ -14,12 +14,7 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.neighbours import pairs_in_radius
 from crowdmap_torch.crowd_lanes.join import JoinedLanes, LaneJoinConfig, join_lanes, unbiased_pieces
-from crowdmap_torch.crowd_lanes.line_samples import (
-    MAX_ANGLE_COS,
-    along_axis,
-    left_of_axis,
-    points_along,
-)
+from crowdmap_torch.crowd_lanes.line_samples import points_along, runs_along
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.tables import Lanes
 
@@ -55,11 +50,6 @@ def share_twice(lanes: Lanes, within: float, *, height_gate: float = 2.0) -> flo
     pair = pairs_in_radius(at.point[:, :2], (within**2 + _STEP**2) ** 0.5)
     pair = pair[at.spline[pair[:, 0]] != at.spline[pair[:, 1]]]
     i, j = torch.cat((pair, pair.flip(1))).T
-    delta, axis = at.point[j] - at.point[i], at.direction[i]
-    beside = (
-        (left_of_axis(delta, axis).abs() < within)
-        & (along_axis(delta, axis).abs() < _STEP)
-        & (along_axis(at.direction[j], axis).abs() > MAX_ANGLE_COS)
-        & (delta[:, 2].abs() < height_gate)
-    )
+    delta, axis, other = at.point[j] - at.point[i], at.direction[i], at.direction[j]
+    beside = runs_along(delta, axis, other, within=within, along=_STEP, height=height_gate)
     return len(torch.unique(i[beside])) / max(len(at), 1)

@@ -128,6 +128,24 @@ def left_of_axis(delta: Float[Tensor, "n _"], axis: Float[Tensor, "n 2"]) -> Flo
     return axis[:, 0] * delta[:, 1] - axis[:, 1] * delta[:, 0]
 
 
+def runs_along(
+    delta: Float[Tensor, "n 3"],
+    axis: Float[Tensor, "n 2"],
+    other: Float[Tensor, "n 2"],
+    *,
+    within: float,
+    along: float,
+    height: float,
+) -> Bool[Tensor, " n"]:
+    """Which points, `delta` [m] from one of a line with this axis, are of one with the axis `other` that runs along it."""
+    return (
+        (left_of_axis(delta, axis).abs() < within)
+        & (along_axis(delta, axis).abs() < along)
+        & (along_axis(other, axis).abs() > MAX_ANGLE_COS)
+        & (delta[:, 2].abs() < height)
+    )
+
+
 def stations(
     point: Float[Tensor, "k 3"], polyline: Int[Tensor, " k"], count: int
 ) -> tuple[Float[Tensor, " k"], Float[Tensor, " n"]]:
