@@ -358,21 +358,21 @@ def made_anew(
 
     Markers that are there twice are joined anew. With it the covariances, if they had to be known for that.
     """
-    rules, trusted = config.duplicate_signs, first.crowd.trusted_frames(journeys)
-    signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
+    rules = config.duplicate_signs
     if first.completed is None or first.anew >= rules.rounds:
         return None, None
-    poses, made = adjust.read_poses(bundle, journeys), [m.lanes for m in maps]
+    signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
+    poses, crowd = adjust.read_poses(bundle, journeys), first.crowd
     drifts = tuple(map(se3.local, (j.T_world_camera for j in journeys), poses))
-    markers = lanes, made, drifts, trusted, first.crowd.positioning
-    joined, once, known = joined_anew(*markers, config.lane_join), None, None
+    markers = lanes, [m.lanes for m in maps], drifts, crowd.trusted_frames(journeys)
+    joined, once, known = joined_anew(*markers, crowd.positioning, config.lane_join), None, None
     if len(may_be_one(signs, journeys, first.associations, rules)):
         known = map_uncertainty(bundle, first.signs, first.lanes, engine)
         signs = replace(signs, covariance=known.of_their_own)
     found = AssociatedSigns(signs, first.tentative, first.associations, first.completed)
     if known is not None:
         given = journeys, poses, [m.sign_tracklets for m in maps], found
-        sound = first.crowd.journey_weight > 0
+        sound = crowd.journey_weight > 0
         once = associated_once(*given, rules, config.complete_tracks, trusted=sound)
     if joined is None and once is None:
         return None, known

@@ -114,6 +114,8 @@ def with_vouched(
     drive has it.
     """
     heads, singles = found.heads, found.tentative
+    if not len(singles):
+        return found
     every, n = concatenate([heads, singles]), len(heads)
     drives = zip(journeys, poses, tracklets, found.associations, strict=True)
     # What lies on no head was compared with all of them before.
@@ -125,13 +127,12 @@ def with_vouched(
         for k, (journey, pose, made, seen) in enumerate(drives)
     )
     every = with_evidence(every, journeys, shown, trusted, completion)
-    is_head = torch.arange(len(every), device=trusted.device) < n
-    kept = is_head | (every.n_journeys >= config.min_journeys)
-    vouched = kept[n:]
+    vouched = every.n_journeys[n:] >= config.min_journeys
     if not bool(vouched.any()):
         return found
     sure = existence(every.n_journeys[n:], passing, config.existence).to(heads.size)
     every = replace(every, confidence=torch.cat((heads.confidence, sure)))
+    kept = torch.cat((vouched.new_ones(n), vouched))
     associations = without_signs(shown, ~kept)
     left = singles[~vouched]
     left = left[still_alone(left, tracklets, associations)]

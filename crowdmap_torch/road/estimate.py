@@ -251,7 +251,7 @@ def _smoothed(
         given = motion, dt, fit, moments, begin, positioning, trusted
         measurements, _ = take_measurements(*given)
         state = smooth_backward(filter_forward(start, measurements, positioning, config.kalman))
-        pitch, roll = softer_springs(motion, dt, state, trusted, config.measurements)
+        pitch, roll = softer_springs(motion, dt, state, trusted)
         looks += 1
         if (pitch, roll) == trusted.shaking or looks == _LOOKS:
             return state, trusted.shaking

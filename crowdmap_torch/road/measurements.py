@@ -197,33 +197,29 @@ def _passes(station: Float[Tensor, " stations"], every: float) -> Bool[Tensor, "
 
 
 def softer_springs(
-    motion: EgoMotion,
-    dt: Float[Tensor, " f"],
-    state: RoadState,
-    trusted: MeasurementConfig,
-    config: MeasurementConfig,
+    motion: EgoMotion, dt: Float[Tensor, " f"], state: RoadState, config: MeasurementConfig
 ) -> tuple[float, float]:
-    """1-sigma of the springs' pitch and roll that a drive shows beside the `state` that was found with `trusted` ones.
+    """1-sigma of the springs' pitch and roll that a drive shows beside the `state` that was found with those of `config`.
 
-    Those that were `trusted`, where it shows hardly more. Means over some seconds tell: who brakes is nose-down for longer
+    Those of `config`, where it shows hardly more. Means over some seconds tell: who brakes is nose-down for longer
     than the springs shake, and what lasts is taken for a slope of the road if it is trusted like what does not.
     """
     longer = _correlated(dt, config).mean()
-    block = (motion.t_s / _BRAKING_S).floor().long()
-    number = torch.bincount(block).to(motion.t_s)
+    stretch = (motion.t_s / _BRAKING_S).floor()
+    _, block, count = torch.unique(stretch, return_inverse=True, return_counts=True)
+    number = count.to(motion.t_s)
 
     def shown(seen: Float[Tensor, " f"], slope: int, stance: int) -> Tensor:
         left = seen - (state.mean[:, stance] - state.mean[:, slope])
         total = torch.zeros_like(number).index_add(0, block, left)
         enough = number >= 2
-        mean_sq = (total.square() / number.clamp_min(1) * enough).sum() / enough.sum().clamp_min(1)
+        mean_sq = (total.square() / number * enough).sum() / enough.sum().clamp_min(1)
         return (mean_sq / longer).sqrt()
 
     found = torch.stack((shown(motion.alpha, SLOPE, STANCE), shown(motion.beta, CROSS, ROLL)))
-    known = trusted.shaking
     pitch, roll = (
         new if new > config.softer_from * old else old
-        for new, old in zip(found.tolist(), known, strict=True)
+        for new, old in zip(found.tolist(), config.shaking, strict=True)
     )
     return pitch, roll
 
