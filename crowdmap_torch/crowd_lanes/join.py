@@ -81,7 +81,7 @@ class LaneJoinConfig(Settings):
     """Of two curves nearer to each other the lesser is dropped, unless ..."""
     seen_together: Share = 0.3
     """... this share of its journeys saw both at once."""
-    least_often: Share = 0.2
+    least_often: Share = 0.25
     """Markers are detected at least this often, as a share of what is usual where the same drives see markers."""
     anew_from: Share = 0.02
     """Where so much of an adjusted map's lanes is there twice, pieces are joined anew by adjusted poses, unless half of that
