@@ -21,10 +21,11 @@ from crowdmap_torch.adjustment.detection_lanes import with_lanes
 from crowdmap_torch.adjustment.footing import Footing, footing_of
 from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
-from crowdmap_torch.crowd_lanes.join import join_lanes, unbiased_pieces
+from crowdmap_torch.crowd_lanes.join import join_lanes
 from crowdmap_torch.crowd_lanes.joined_anew import joined_anew
+from crowdmap_torch.crowd_lanes.placed_drives import place_drives
 from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
-from crowdmap_torch.crowd_lanes.tie_groups import GroupTies, tie_groups
+from crowdmap_torch.crowd_lanes.tie_groups import GroupTies
 from crowdmap_torch.crowd_signs.complete_tracks import (
     AssociatedSigns,
     CompletedTracks,
@@ -34,7 +35,6 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
 )
 from crowdmap_torch.crowd_signs.duplicates import may_be_one
 from crowdmap_torch.crowd_signs.gather import gather_signs
-from crowdmap_torch.crowd_signs.groups import groups_of
 from crowdmap_torch.crowd_signs.journey_bias import without_bias
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
 from crowdmap_torch.fleet.choice import engine_of
@@ -246,21 +246,21 @@ def first_map(
     signs, sigma = concatenate([m.signs for m in maps]), config.positioning.bias_sigma_m
     gathered = gather_signs(journeys, tracklets, signs, bias_sigma_m=sigma)
     generator = torch.Generator().manual_seed(config.seed)
-    crowd = register_crowd(gathered, config.positioning, config.crowd, generator=generator)
-    given, made = [journey.T_world_camera for journey in journeys], [m.lanes for m in maps]
-    poses, drifts = without_bias(given, crowd.bias)
-    ties = None
+    made, known = [m.lanes for m in maps], (config.positioning, config.crowd)
+    crowd, ties = register_crowd(gathered, *known, generator=generator), None
     if config.crowd.method != "paper2017":
-        pieces = unbiased_pieces(made, drifts, trusted := crowd.trusted_frames(journeys))
-        known = groups_of(crowd), gathered.bias_sigma, crowd.positioning
-        ties = tie_groups(pieces, poses, *known, config.lane_join.tie_groups)
-        if bool(ties.move.any()):
-            crowd = crowd.moved(ties.move)
-            poses, drifts = without_bias(given, crowd.bias)
-            pieces = unbiased_pieces(made, drifts, trusted)
-        joined = join_lanes(pieces, crowd.positioning, config.lane_join)
+        tie = config.crowd.match, config.lane_join.tie_groups
+        how = gathered.bias_sigma, config.positioning, *tie
+        placed = place_drives(journeys, made, crowd, *how)
+        if (start := placed.better) is not None:
+            crowd = register_crowd(gathered, *known, generator=generator, start=start)
+            placed = place_drives(journeys, made, crowd, *how, doubt=False)
+        poses, drifts, ties = placed.poses, placed.drifts, placed.ties
+        crowd = crowd.moved(ties.move)
+        joined = join_lanes(placed.pieces, crowd.positioning, config.lane_join)
         lanes, support, rounds = joined.lanes, joined.support, ()
     else:
+        poses, drifts = without_bias([j.T_world_camera for j in journeys], crowd.bias)
         pieces = concatenate_lanes(made)
         clusters = cluster_lanes(pieces, config.lane_cluster, generator=generator)
         lanes, rounds = clusters.heads, clusters.rounds

@@ -39,7 +39,7 @@ FLOORS = (
     ("__main__", "__init__"),
 )
 """Every room of the house, from the ground up; the modules of the root are rooms of their own."""
-NEIGHBOURS = {"signs": {"road"}, "lanes": {"road"}}
+NEIGHBOURS = {"signs": {"road"}, "lanes": {"road"}, "crowd_lanes": {"crowd_signs"}}
 """What rooms of one floor may import of each other."""
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 SIGN_TABLES = {

@@ -1,11 +1,11 @@
-"""Drives that no sign ties to others, placed by the lane markers that both have seen (V-A.2, V-B).
+"""Drives that no sign ties to others for certain, placed by the lane markers that both have seen (V-A.2, V-B).
 
 Whoever drives the other way sees other signs. The biases of two such groups of drives are known among themselves alone,
 and between them a metre or more may be left, which is another marker's place. One marker cannot tell; the whole pattern of
 a road's markers can, and where roads turn it tells both axes. A sample of one group, moved by a shift, speaks against it
 where the other drives would have seen it and saw no parallel marker there; what lies farther beside their ways than they
 see says nothing, as whoever drives the other way may see one marker of three. Along a straight road every shift is as
-likely, and the prior decides.
+likely, and the prior decides. What signs tie loosely is placed by both: where markers fit and signs like its own are.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from crowdmap_torch.crowd_lanes.line_samples import (
     left_of_axis,
 )
 from crowdmap_torch.crowd_lanes.samples import sample_lanes
+from crowdmap_torch.crowd_lanes.shift_prior import ShiftPrior
+from crowdmap_torch.crowd_signs.groups import OtherPlaces
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.robust import median_along
@@ -64,6 +66,10 @@ class GroupTieConfig(Settings):
     """A shift counts that is likelier than none by more than this in the logarithm."""
     rival_m: Length = 1.0
     """Another one this far away that is as likely, but for `surer`, leaves it open which is right."""
+    sign_noise_m: Length = 0.5
+    """1-sigma of what is between a sign of a drive that signs tie loosely and another one that it may be."""
+    sign_missed: Share = 0.02
+    """Likelihood of a sign that none like it is near, relative to one that is met."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,8 @@ class GroupTies:
     """The group of each journey."""
     rival: Float[Tensor, "g 3"]
     """By group another place that the lanes fit about as well, seen from where it is put [m]; zero: there is none."""
+    is_shifted: Bool[Tensor, " g"]
+    """Groups that lanes moved against those that they were put beside."""
 
     @property
     def open_groups(self) -> list[int]:
@@ -90,16 +98,19 @@ def tie_groups(
     bias_sigma: Float[Tensor, "j 3"],
     positioning: PositioningNoise,
     config: GroupTieConfig,
+    others: OtherPlaces | None = None,
 ) -> GroupTies:
     """How far groups of drives are to be moved for their lane markers to be one pattern.
 
-    `group` says of each journey which others its signs tie it to, `bias_sigma` [m] how uncertain its bias was at first.
-    The pieces and the poses, `ways`, have what is known of the biases taken off. The largest group comes first, then group
-    by group that has lanes beside those that are placed already.
+    `group` says of each journey which others its signs tie it to, `bias_sigma` [m] how uncertain its bias was at first,
+    `others` where else drives fit that signs tie loosely: those are groups of their own. The pieces and the poses, `ways`,
+    have what is known of the biases taken off. The largest group comes first, then group by group that has lanes beside
+    those that are placed already.
     """
     groups = int(group.max()) + 1 if len(group) else 0
     move = bias_sigma.new_zeros(len(group), 3)
-    ties = GroupTies(move, group, bias_sigma.new_zeros(groups, 3))
+    nothing = bias_sigma.new_zeros(groups, 3)
+    ties = GroupTies(move, group, nothing, nothing[:, 0] > 0)
     if groups < 2 or not len(lanes):
         return ties
     samples = sample_lanes(
@@ -116,21 +127,30 @@ def tie_groups(
         found = False
         for one in list(left):
             own = group == one
+            loose = None if others is None else others.of(own, placed)
+            if loose is not None:
+                move[own] = ShiftPrior.followed(loose, move)
             moved = replace(samples, point=samples.point + move[samples.owner])
             of_one = _Seen.of(moved[of_sample == one], ways, move, config)
             of_others = moved[placed[samples.owner]]
-            others = _Seen.of(of_others, ways, move, config, beside=of_one.way)
+            there = _Seen.of(of_others, ways, move, config, beside=of_one.way)
             of_own, of_placed = (_variance_of_mean(bias_sigma, some) for some in (own, placed))
             sigma = (of_own + of_placed).sqrt()
-            best = _best_shift(of_one, others, sigma, drifting)
+            prior = ShiftPrior(sigma, loose, move)
+            best = _best_shift(of_one, there, prior, drifting)
             if best is None:
                 continue
             shift, ties.rival[one] = best
+            ties.is_shifted[one] = bool(shift.any())
             share = of_placed / (of_own + of_placed)
             move[own] += (1 - share) * shift
             move[placed] -= share * shift
             placed, found = placed | own, True
             left.remove(one)
+    for one in left:
+        loose = None if others is None else others.of(group == one, placed)
+        if loose is not None:
+            move[group == one] = ShiftPrior.followed(loose, move)
     return ties
 
 
@@ -191,15 +211,13 @@ def _nearest(
 _FAR_M = 30.0
 """Farther beside a way no lane marker is seen."""
 _NEARLY_ALL = 0.95
-_FREEDOM = 4.0
-"""Degrees of freedom of shifts, as Student's t has them: a few drives tell little of how large biases are."""
 
 
 def _best_shift(
-    own: _Seen, others: _Seen, sigma: Float[Tensor, " 3"], config: GroupTieConfig
+    own: _Seen, others: _Seen, prior: ShiftPrior, config: GroupTieConfig
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]] | None:
     """The likeliest shift of a group onto others, and from there to a rival, zero where none is; None: nothing is near."""
-    none = torch.zeros_like(sigma)
+    none, sigma = torch.zeros_like(prior.sigma), prior.sigma
     farthest = (config.reach * sigma[:2]).clamp_min(config.reach_m)
     steps = (farthest / config.step_m).ceil().long().clamp_min(1)
     axes = [config.step_m * torch.arange(-int(n), int(n) + 1).to(sigma) for n in steps]
@@ -207,8 +225,8 @@ def _best_shift(
     here, there = _Said.of(own, others, grid, config), _Said.of(others, own, -grid, config)
     if here is None or there is None:
         return None
-    odds = (1 + (grid / sigma[:2]).square().sum(-1) / _FREEDOM).log()
-    logs = (here.logs + there.logs) / 2 - (_FREEDOM + 2) / 2 * odds
+    known = prior.logs(grid, sign_noise_m=config.sign_noise_m, sign_missed=config.sign_missed)
+    logs = (here.logs + there.logs) / 2 + known
     told = _Told(logs, grid, axes, config)
     best, other, mean = told.best, told.rival(), told.mean()
     shift = torch.cat((mean, _height_between(here.pairs, mean, config)[None]))

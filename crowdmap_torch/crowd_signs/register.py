@@ -62,7 +62,7 @@ from crowdmap_torch.crowd_signs.outlier_journeys import (
     journey_statistics,
 )
 from crowdmap_torch.crowd_signs.rounds import CrowdRound, crowd_round
-from crowdmap_torch.crowd_signs.stretches import first_biases
+from crowdmap_torch.crowd_signs.stretches import FirstBiases, first_biases
 from crowdmap_torch.crowd_signs.vote import VoteConfig
 from crowdmap_torch.crowd_signs.wander_length import likely_wander
 from crowdmap_torch.geometry.trajectory import station
@@ -190,12 +190,16 @@ def register_crowd(
     config: CrowdConfig,
     *,
     generator: torch.Generator | None = None,
+    start: FirstBiases | None = None,
 ) -> Crowd:
-    """The signs of all journeys in clusters, one for each physical sign, and the bias of each journey (V-A.1, V-B)."""
-    if generator is None:
-        generator = torch.Generator().manual_seed(0)
-    register = _register_paper if config.method == "paper2017" else _register_joint
-    return register(crowd, positioning, config, generator)
+    """The signs of all journeys in clusters, one for each physical sign, and the bias of each journey (V-A.1, V-B).
+
+    `start` are first biases that are better than what signs tell by themselves; `joint` only.
+    """
+    generator = generator or torch.Generator().manual_seed(0)
+    if config.method == "paper2017":
+        return _register_paper(crowd, positioning, config, generator)
+    return _register_joint(crowd, positioning, config, generator, start)
 
 
 def unbiased_signs(crowd: CrowdSigns, bias: JourneyBias) -> Signs:
@@ -243,9 +247,11 @@ def _register_joint(
     positioning: PositioningNoise,
     config: CrowdConfig,
     generator: torch.Generator,
+    start: FirstBiases | None,
 ) -> Crowd:
     signs, journeys = crowd.signs, crowd.journeys
-    bias, larger = first_biases(crowd, positioning, config.align, config.vote, generator=generator)
+    told = positioning, config.align, config.vote
+    bias, larger = start or first_biases(crowd, *told, generator=generator)
     crowd = replace(crowd, bias_sigma=larger * crowd.bias_sigma)
     east, north, up = (larger * larger.new_tensor(positioning.bias_sigma_m)).tolist()
     positioning = replace(positioning, bias_sigma_m=(east, north, up))
@@ -292,9 +298,8 @@ def _register_joint(
         heads = rough_heads(with_covariance(unbiased, extra), label, weight=weight[signs.journey])
         sigma = miss_sigma(crowd, unbiased, label, heads)
         extra = unexplained_covariance(crowd, torch.maximum(least, sigma))
-        drift = largest_drift(bias)
         statistics = journey_statistics(
-            unbiased, label, heads, company, bias.translation, drift, crowd.leap
+            unbiased, label, heads, company, bias.translation, largest_drift(bias), crowd.leap
         )
         outliers = find_outlier_journeys(statistics, config.outlier_journeys)
         weight = torch.ones_like(weight)

@@ -30,6 +30,10 @@ _EXPECTED = 4.0
 """What is expected of biases counts as much as so many drives."""
 
 
+FirstBiases = tuple[JourneyBias, Float[Tensor, " 3"]]
+"""Biases, and how many times as large as expected they are, by axis."""
+
+
 def first_biases(
     crowd: CrowdSigns,
     positioning: PositioningNoise,
@@ -37,7 +41,7 @@ def first_biases(
     config: VoteConfig,
     *,
     generator: torch.Generator,
-) -> tuple[JourneyBias, Float[Tensor, " 3"]]:
+) -> FirstBiases:
     """The biases that `vote_by_stretch` finds, and how many times as large as expected they are, at least one, by axis.
 
     Shifts of more than what is expected lose the vote to wrong ones between neighbours: a drive is placed beside all

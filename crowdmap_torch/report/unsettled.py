@@ -39,9 +39,10 @@ def _of_ties(dataset: Dataset, first: FirstMap) -> tuple[Finding, ...]:
     return tuple(
         Finding(
             "untied-drives",
-            "no sign ties these drives to the others, and their lane markers fit those of the others about as well "
+            "no sign ties these drives to the others for certain, and their lane markers fit theirs about as well "
             f"{float(ties.rival[one].norm()):.1f} m beside where they are",
-            "they drove the other way, or another road for most of it, and biases of positioning are metres",
+            "they drove the other way, or another road for most of it, or saw signs alone that others like them stand "
+            "beside, and biases of positioning are metres",
             "trust distances between what they saw and what the others saw to that; add drives that see signs of both, "
             "or pin signs of both by --control",
             tuple(

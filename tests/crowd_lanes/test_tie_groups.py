@@ -11,6 +11,7 @@ from torch import Tensor
 from worlds import lane_world
 
 from crowdmap_torch.crowd_lanes.tie_groups import GroupTieConfig, GroupTies, _Told, tie_groups
+from crowdmap_torch.crowd_signs.groups import OtherPlaces
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.tables import Lanes
@@ -109,6 +110,42 @@ def test_what_fits_as_well_otherwise_is_told():
     assert abs(abs(float(relative(ties)[1])) - 1.75) < 0.3
     # The other one is to the other side.
     assert abs(float(ties.rival[1, 1] + 2 * relative(ties)[1])) < 0.3
+
+
+def alike(*aside: float, hosts: int = 3) -> OtherPlaces:
+    """The last of four drives has one sign; those like it are so far to the left of its place, its own first."""
+    n = len(aside)
+    shift = torch.tensor([(0.0, left) for left in aside], dtype=torch.float64)
+    seen_by = (torch.arange(4) < hosts).expand(n, 4)
+    nothing = torch.zeros(4, 2, dtype=torch.float64)
+    is_own = torch.arange(n) == 0
+    return OtherPlaces(torch.full((n,), 3), 0 * is_own, is_own, shift, seen_by, nothing)
+
+
+@pytest.mark.parametrize("way_out", [-1.0, 1.0])
+def test_where_lanes_fit_twice_signs_that_are_alike_tell(way_out: float):
+    """Markers 3.5 m apart; those of the last drive are half way between the others'."""
+    lines = [along(3.5 * k, 400) for k in range(-3, 4)]
+    step = np.array([0.0, 1.75, 0.0])
+    rows = [(line, drive) for drive in range(3) for line in lines]
+    rows += [(line + step, 3) for line in lines[:-1]]
+    control, journey = (list(column) for column in zip(*rows, strict=True))
+    made = lane_world.pieces(
+        control,
+        type=[0] * len(rows),
+        journey=journey,
+        tracklet=[*range(len(rows))],
+        frame=[50] * len(rows),
+    )
+    ways = [way(0.0, 400)] * 4
+    group = torch.tensor([0, 0, 0, 1])
+    told = made, ways, group, SIGMA, NOISE, CONFIG
+    ties = tie_groups(*told, others=alike(0.0, 1.9 * way_out))
+    moved = ties.move[3, 1] - ties.move[0, 1]
+    assert abs(float(moved) - 1.75 * way_out) < 0.4
+    assert ties.is_shifted.tolist() == [False, True] and ties.open_groups == []
+    # Where its own sign is the only one, neither place is better.
+    assert tie_groups(*told, others=alike(0.0)).open_groups == [1]
 
 
 @pytest.mark.parametrize(("valley", "mean"), [(-1.0, 0.0), (-20.0, -2.0)])

@@ -43,7 +43,8 @@ def test_drives_that_may_lie_elsewhere_are_named(tiny: Dataset, tiny_result: Map
     journeys = len(tiny.journeys)
     group, rival = torch.arange(journeys), torch.zeros(journeys, 3, dtype=torch.float64)
     rival[1, 1] = -2.5
-    ties = replace(first.ties, group=group, rival=rival)
+    shifted = torch.zeros(journeys, dtype=torch.bool)
+    ties = replace(first.ties, group=group, rival=rival, is_shifted=shifted)
     (finding,) = unsettled_findings(tiny, replace(first, ties=ties))
     assert finding.kind == "untied-drives"
     assert finding.journeys == (tiny.journeys[1].journey_id,)
