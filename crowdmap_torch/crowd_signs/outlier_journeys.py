@@ -66,7 +66,7 @@ class JourneyStatistics:
     signs: Int[Tensor, " j"]
     """Signs triangulated."""
     checked: Int[Tensor, " j"]
-    """Those of them that others passed by."""
+    """Those of them that others passed by: two or more, or one that saw the sign too."""
     matched: Float[Tensor, " j"]
     """Share of them that other journeys saw too, of those that others passed by."""
     bias: Float[Tensor, " j"]
@@ -107,11 +107,13 @@ def journey_statistics(
     used = label >= 0
     member, head = signs[used], heads[label[used]]
     number = group_count(signs.journey, journeys)
-    checked = group_count(signs.journey[company], journeys)
-    matched = group_count(signs.journey[company & used], journeys) / checked.clamp_min(1)
     # What nobody else saw is its own head.
     of, _, _ = distinct_pairs(label[used], member.journey)
     common = (group_count(of, len(heads)) > 1)[label[used]]
+    # Who saw a sign has passed by it, be it the only one.
+    passed = company.index_fill(0, torch.nonzero(used)[:, 0][common], True)
+    checked = group_count(signs.journey[passed], journeys)
+    matched = group_count(signs.journey[passed & used], journeys) / checked.clamp_min(1)
     of_common = member.journey[common]
     count = group_count(of_common, journeys)
 

@@ -143,9 +143,23 @@ def test_turns_of_signs_are_told_apart(axis: tuple[float, float, float], column:
     assert getattr(found, other).tolist() == pytest.approx([0, 0], abs=1e-9)
 
 
+NOBODY = torch.zeros(6, dtype=torch.bool)
+
+
 def test_what_nobody_else_passed_by_does_not_count_as_unmatched():
-    found = statistics_of(torch.tensor([True, *[False] * 5]))
-    assert found.matched[0] == 1 and found.matched[1].isnan()
+    found = statistics_of(NOBODY, label=(-1, -1, -1, 0, 1, -1))
+    assert found.checked.tolist() == [0, 0] and found.matched.isnan().all()
+    found = statistics_of(torch.arange(6) == 2, label=(-1, -1, -1, 0, 1, -1))
+    assert found.checked.tolist() == [1, 0] and found.matched[0] == 0
+
+
+def test_who_saw_a_sign_too_has_passed_by_it():
+    # Where one other drive came by nobody misses it, but where that one saw the sign it fits.
+    found = statistics_of(NOBODY, label=(0, 1, -1, 0, 1, -1))
+    assert found.checked.tolist() == [2, 2] and found.matched.tolist() == [1, 1]
+    found = statistics_of(torch.arange(6) == 5, label=(0, 1, -1, 0, 1, -1))
+    assert found.checked.tolist() == [2, 3]
+    assert found.matched.tolist() == pytest.approx([1, 2 / 3])
 
 
 def test_nobody_is_judged_by_few_signs_where_others_passed_by():
@@ -155,7 +169,6 @@ def test_nobody_is_judged_by_few_signs_where_others_passed_by():
     checked = unseen.checked.clone()
     checked[4] = CONFIG.min_signs - 1
     assert find_outlier_journeys(replace(unseen, checked=checked), CONFIG) == ()
-    assert statistics_of(torch.tensor([True, *[False] * 5])).checked.tolist() == [1, 0]
 
 
 def test_what_few_signs_say_that_others_saw_too_is_not_judged():
