@@ -84,19 +84,30 @@ def other_places(
     good = cost <= dearest[sign]
     sign, to, own = sign[good], to[good], own[good]
     journey, shift = members.journey[sign], head[to, :2] - place[sign, :2]
+    far = shift.norm(dim=1) > nearest
+    every = group_count(members.journey[used], journeys)
+    # Where a sign has none like it nothing has to be compared: of long drives that is one of many.
+    may_be = every == group_count(members.journey[torch.unique(sign[far])], journeys)
+    kept = may_be[journey]
+    sign, to, own, far = sign[kept], to[kept], own[kept], far[kept]
+    journey, shift = journey[kept], shift[kept]
     layers = layered(shift, journey, _TOGETHER_M)
-    one, other, _ = pairs_between(layers, layers, radius=_TOGETHER_M)
+    one, other, _ = pairs_between(layers[far], layers, radius=_TOGETHER_M)
     met = torch.unique(torch.stack((one, sign[other]), dim=1), dim=0)[:, 0]
-    every = group_count(members.journey[used], journeys)[journey]
-    rival = (group_count(met, len(sign)) == every) & (shift.norm(dim=1) > nearest)
-    kept = torch.isin(journey, journey[rival])
-    sign, to, own, journey = sign[kept], to[kept], own[kept], journey[kept]
-    seen_by = torch.zeros(len(head), journeys, dtype=torch.bool, device=label.device)
-    seen_by[label[used], members.journey[used]] = True
-    seen_by = seen_by[to]
+    of_rival = journey[far]
+    loose = of_rival[group_count(met, len(of_rival)) == every[of_rival]]
+    kept = torch.isin(journey, loose)
+    sign, to, own = sign[kept], to[kept], own[kept]
+    journey, shift = journey[kept], shift[kept]
+    # Of the heads that are asked for alone: a city has many heads and many journeys.
+    heads, place_of = torch.unique(to, return_inverse=True)
+    of_heads = used[torch.isin(label[used], heads)]
+    seen_by = torch.zeros(len(heads), journeys, dtype=torch.bool, device=label.device)
+    seen_by[torch.searchsorted(heads, label[of_heads]), members.journey[of_heads]] = True
+    seen_by = seen_by[place_of]
     seen_by[torch.arange(len(to), device=to.device), journey] = False
     bias = crowd.bias.translation[:, :2]
-    return OtherPlaces(journey, sign, own, shift[kept], seen_by, bias)
+    return OtherPlaces(journey, sign, own, shift, seen_by, bias)
 
 
 def groups_of(crowd: Crowd, loosely: Bool[Tensor, " j"]) -> Int[Tensor, " j"]:
