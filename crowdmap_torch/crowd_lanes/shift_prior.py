@@ -48,7 +48,7 @@ class ShiftPrior:
         fit = grid.new_zeros(len(sign), *grid.shape[:2])
         fit.scatter_reduce_(0, row[:, None, None].expand_as(away), (-away / 2).exp(), "amax")
         said = (sign_missed + fit).log().sum(0)
-        return said + self._of_bias(grid - loose.bias[loose.journey[0]] + own[0])
+        return said + self._of_bias(grid - loose.bias[0] + own[0])
 
     def _of_bias(self, shift: Float[Tensor, "x y 2"]) -> Float[Tensor, "x y"]:
         odds = (1 + (shift / self.sigma[:2]).square().sum(-1) / _FREEDOM).log()

@@ -117,9 +117,8 @@ def alike(*aside: float, hosts: int = 3) -> OtherPlaces:
     n = len(aside)
     shift = torch.tensor([(0.0, left) for left in aside], dtype=torch.float64)
     seen_by = (torch.arange(4) < hosts).expand(n, 4)
-    nothing = torch.zeros(4, 2, dtype=torch.float64)
-    is_own = torch.arange(n) == 0
-    return OtherPlaces(torch.full((n,), 3), 0 * is_own, is_own, shift, seen_by, nothing)
+    is_own, head = torch.arange(n) == 0, torch.arange(n)
+    return OtherPlaces(torch.full((n,), 3), 0 * head, head, is_own, shift, 0 * shift, seen_by)
 
 
 @pytest.mark.parametrize("way_out", [-1.0, 1.0])
