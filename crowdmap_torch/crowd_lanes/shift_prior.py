@@ -24,12 +24,6 @@ class ShiftPrior:
     move: Float[Tensor, "j 3"]
     """By how much journeys have been moved, and the drive itself with those that have seen its own heads [m]."""
 
-    @staticmethod
-    def followed(loose: OtherPlaces, move: Float[Tensor, "j 3"]) -> Float[Tensor, " 3"]:
-        """The move of those that have seen the heads of a drive's own signs; none of them: zero."""
-        host = loose.host[loose.is_own][:1]
-        return move[host].sum(0)
-
     def logs(
         self, grid: Float[Tensor, "x y 2"], *, sign_noise_m: float, sign_missed: float
     ) -> Float[Tensor, "x y"]:

@@ -129,7 +129,7 @@ def tie_groups(
             own = group == one
             loose = None if others is None else others.of(own, placed)
             if loose is not None:
-                move[own] = ShiftPrior.followed(loose, move)
+                move[own] = loose.followed(move)
             moved = replace(samples, point=samples.point + move[samples.owner])
             of_one = _Seen.of(moved[of_sample == one], ways, move, config)
             of_others = moved[placed[samples.owner]]
@@ -150,7 +150,7 @@ def tie_groups(
     for one in left:
         loose = None if others is None else others.of(group == one, placed)
         if loose is not None:
-            move[group == one] = ShiftPrior.followed(loose, move)
+            move[group == one] = loose.followed(move)
     return ties
 
 

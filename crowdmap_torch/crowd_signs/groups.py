@@ -59,6 +59,10 @@ class OtherPlaces(Rows):
         """One of the journeys that have seen each head."""
         return self.seen_by.long().argmax(1)
 
+    def followed(self, move: Float[Tensor, "j 3"]) -> Float[Tensor, " 3"]:
+        """By how much those were moved who have seen the heads of own signs; zero: nobody has [m]."""
+        return move[self.host[self.is_own][:1]].sum(0)
+
 
 def other_places(
     crowd: Crowd, config: HeadMatchConfig, *, nearest: float, farthest: float
