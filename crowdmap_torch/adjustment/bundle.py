@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,6 +15,7 @@ from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.landmark_terms import about_usual_size, size_class_term, slide_term
 from crowdmap_torch.adjustment.lane_matching import follow
 from crowdmap_torch.adjustment.lane_terms import lane_point_terms
+from crowdmap_torch.adjustment.noise_pull import held_off, noise_pull_term
 from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.adjustment.parts import Observations, Priors, SharedOut, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
@@ -59,6 +60,14 @@ _WHITE_RESTS = 0.03
 """A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
 _LASTING_RESTS = 0.1
 """The variance of a detection's shift that would change by less than this share is at rest."""
+
+
+@dataclass(frozen=True)
+class Evidence(PoseEvidence):
+    """What the observations of a bundle tell of its poses' errors, and how far these draw signs near."""
+
+    held_off: Float[Tensor, " d"]
+    """By detection of corners (`noise_pull`)."""
 
 
 class Bundle(BundleState):
@@ -120,7 +129,7 @@ class Bundle(BundleState):
 
     @torch.no_grad()
     def refresh(
-        self, evidence: PoseEvidence | None = None, of_border: BorderInformation | None = None
+        self, evidence: Evidence | None = None, of_border: BorderInformation | None = None
     ) -> bool:
         """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
 
@@ -146,6 +155,7 @@ class Bundle(BundleState):
                 self.told_at.copy_(made_with)
                 self.drift_told.copy_(evidence.told)
                 self.poses_left.copy_(evidence.left)
+                self.held_off.copy_(evidence.held_off)
             at_rest &= self._rescale_noise(values, evidence)
         if of_border is not None:
             scaled = self.fleet, values, of_border, self.calibration_scales
@@ -164,18 +174,30 @@ class Bundle(BundleState):
         self.refreshed.fill_(True)
         return at_rest
 
-    def evidence(self) -> PoseEvidence | None:
+    def evidence(self) -> Evidence | None:
         """What was found last, as long as the scales are what it was found by; None: it is to be found anew."""
         holds = torch.isclose(self.scales(), self.told_at, rtol=_TOLD_HOLDS, atol=0)
-        return PoseEvidence(self.drift_told, self.poses_left) if bool(holds.all()) else None
+        found = self.drift_told, self.poses_left, self.held_off
+        return Evidence(*found) if bool(holds.all()) else None
 
-    def told_by(self, equations: MapEquations) -> PoseEvidence:
-        """What normal equations that were solved at the bundle's scales tell of the poses' errors."""
-        if len(self.poses_left):
+    def told_by(self, equations: MapEquations, corners: CostTerm | None) -> Evidence:
+        """What normal equations solved at the bundle's scales, and their term of `corners`, tell of poses' errors."""
+        told, left, off = torch.zeros_like(self.drift_told), self.poses_left, self.held_off
+        if len(left):
             found = pose_evidence(self.prior, equations, self.prior_scale)
-        else:
-            found = PoseEvidence(torch.zeros_like(self.drift_told), self.poses_left)
-        return replace(found, told=self._of_journeys(found.told))
+            told, left = found.told, found.left
+        if corners is not None and len(off) and self.config.method != "paper2017":
+            values = self.values()
+            seen = corners, self.detections, self.variables, values
+            of_pose = equations.conditional_covariance("pose")
+            error = whitened_residuals(replace(self._white_term(), weight=None), values)
+            off = held_off(*seen, of_pose, error, self.corners.journey, len(told))
+        return Evidence(self._of_journeys(told), left, off)
+
+    def _white_term(self) -> CostTerm:
+        """Of poses' errors from frame to frame."""
+        term = self.prior.terms(self.prior_scale, self.white_scale)["pose_white"]
+        return self.fleet.of_poses(term, self._by_mount)
 
     def _of_journeys(self, own: Float[Tensor, "j k"]) -> Float[Tensor, "j k"]:
         """What there is of every journey, each told by whoever has it."""
@@ -186,7 +208,7 @@ class Bundle(BundleState):
     def _rescale_noise(self, values: dict[str, Tensor], evidence: PoseEvidence) -> bool:
         """Finds the noise of poses from frame to frame; returns whether it has come to rest."""
         scales = self.prior_scale, self.white_scale
-        term = self.fleet.of_poses(self.prior.terms(*scales)["pose_white"], self._by_mount)
+        term = self._white_term()
         residual = whitened_residuals(term, values) if len(term) else self.poses_left
         found = self._of_journeys(white_scales(self.prior, residual, evidence.left, *scales))
         return self._follow("white_scale", found, _WHITE_RESTS, _WHITE_RESTS)
@@ -275,7 +297,8 @@ class Bundle(BundleState):
 
         Of a bundle that was never refreshed they are found first.
         """
-        return self._problem({**self._terms(self.prior_scale), **self._slide_term()})
+        held = self._slide_term() | self._hold_off_term()
+        return self._problem({**self._terms(self.prior_scale), **held})
 
     def information(self, prior_scale: Float[Tensor, "j _"]) -> Problem:
         """The problem whose Hessian tells what is known: nothing held, `prior_scale` for that of the bundle.
@@ -350,6 +373,12 @@ class Bundle(BundleState):
         bound = self.scale.new_tensor(self.config.tukey_c * reach)
         loss = JointTukey.by_efficiency(detection, bound, row_dim=_PIXEL_DIM)
         return loss.without(self.given_up[detection])
+
+    def _hold_off_term(self) -> dict[str, CostTerm]:
+        if not len(self.corners) or self.config.method == "paper2017":
+            return {}
+        rows, first = self.corners, self.detections.first
+        return {"noise_pull": noise_pull_term(rows.frame[first], rows.sign[first], self.held_off)}
 
     def _slide_term(self) -> dict[str, CostTerm]:
         if not len(self.lane_points):

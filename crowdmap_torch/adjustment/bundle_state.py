@@ -64,8 +64,10 @@ class BundleState(nn.Module):
     """By journey and number of a pose, the share of the drift's changes that observations tell."""
     poses_left: Tensor
     """Variance that is left of every pose's deviation from its drift."""
+    held_off: Tensor
+    """By detection of corners, how strongly its sign and its camera are held off each other [m] (`noise_pull`)."""
     told_at: Tensor
-    """The scales by which both were found; NaN before."""
+    """The scales by which all three were found; NaN before."""
 
     def __init__(
         self,
@@ -78,6 +80,7 @@ class BundleState(nn.Module):
         super().__init__()
         self.together = ALONE if shared_out is None else shared_out.together
         values, corners = unknowns.values, observations.corners
+        self._detections = KeptDetections()
         self.fleet, self.config = priors.fleet, config
         own = {
             name: Variable(values[name].shape[1], euclidean, pull=pull_euclidean)
@@ -110,11 +113,12 @@ class BundleState(nn.Module):
         self.register_buffer("calibration_far", far)
         self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
         self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
+        self.register_buffer("held_off", values["pose"].new_zeros(0))
         self.register_buffer("told_at", torch.full_like(self.scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         # Their matrices are the bundle's own: lenses are taken anew in place.
         points = observations.lane_points
-        self.corners = replace(corners, matrix=corners.matrix.clone())
+        self.see(replace(corners, matrix=corners.matrix.clone()))
         self.lane_points = replace(points, matrix=points.matrix.clone())
         self.lenses = observations.lenses
         self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
@@ -127,7 +131,6 @@ class BundleState(nn.Module):
         self.register_buffer("refreshed", torch.zeros_like(self.judged, dtype=torch.bool))
         self._by_optics = _no_derivatives(self.fleet, self.corners, self.lane_points)
         self._by_mount = self.fleet.by_mount(values["pose"])
-        self._detections = KeptDetections()
         self._backend: ChainBackend | JourneyBackend | None = None
 
     @property
@@ -200,6 +203,11 @@ class BundleState(nn.Module):
             self.fleet,
             self.lane_axes[:, :, 1],
         )
+
+    def see(self, corners: CornerObservations) -> None:
+        """Takes these corners of signs for those that were seen; nothing is held off by their detections yet."""
+        self.corners = corners
+        self.held_off = self.scale.new_zeros(len(self.detections.count))
 
     def rest(self) -> None:
         """Puts the observations, which others have, into a file, and forgets what follows from them until `relinearise`."""

@@ -37,6 +37,8 @@ class CornerDetections:
     """Rows of the detection that has most."""
     count: Float[Tensor, " d"]
     """Rows of each detection."""
+    first: Int[Tensor, " d"]
+    """Its first row."""
     follower: Int[Tensor, " d"]
     """The next detection of each one's sign in its journey; -1: there is none."""
 
@@ -78,7 +80,7 @@ def corner_detections(rows: CornerObservations) -> CornerDetections:
     follower = torch.full_like(order, -1)
     follower[before] = torch.where(same, after, -1)
     most = int(count.max()) if len(count) else 0
-    return CornerDetections(run, rank, most, count.to(rows.px), follower)
+    return CornerDetections(run, rank, most, count.to(rows.px), first, follower)
 
 
 def shared_errors(

@@ -48,11 +48,13 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
         # What was added up leaves room between what is kept, where it went to.
         give_back()
     state = lm.step(problem, state, bundle.config.lm, backend=backend)
+    corners = problem.terms.get("sign_reprojection")
     # As large as what the lenses are taken anew in.
     del problem
     if not bool(state.accepted.all()):
         return state, state.done
-    evidence = bundle.evidence() or bundle.told_by(normal)
+    evidence = bundle.evidence() or bundle.told_by(normal, corners)
+    del corners
     of_border = normal.border_information() if bundle.fleet.kinds else None
     bundle.fold(dict(state.values))
     at_rest = bundle.refresh(evidence, of_border)

@@ -65,7 +65,7 @@ def innovations(
     gradient = covariance.new_zeros(n, k)
     matrix = covariance.new_zeros(n, k * k)
     for at, piece in chunks(replace(term, loss=Quadratic())):
-        blocks = row_blocks(piece, variables, values)
+        blocks = row_blocks(piece, variables, values, slots=1)
         s[at] = blocks.rho
         add_at(gradient, 0, run[at], blocks.gradient[0].mT)
         add_at(matrix, 0, run[at], blocks.hessian[0, 0].flatten(0, 1).mT)

@@ -167,9 +167,12 @@ class RowBlocks:
         )
 
 
-def row_blocks(term: CostTerm, variables: Mapping[str, Variable], values: Values) -> RowBlocks:
-    """Every row's gradient and Hessian blocks."""
+def row_blocks(
+    term: CostTerm, variables: Mapping[str, Variable], values: Values, *, slots: int | None = None
+) -> RowBlocks:
+    """Every row's gradient and Hessian blocks; of the first so many `slots` alone, where it is given."""
     residual, jacobians, weight, rho = _weighted(term, variables, values)
+    jacobians = jacobians[:slots]
     hessian: dict[tuple[int, int], Tensor] = {}
     for i, J in enumerate(jacobians):
         pulling = J if isinstance(J, Follows) else _weighted_rows(J, weight)

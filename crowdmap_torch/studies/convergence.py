@@ -83,7 +83,7 @@ class MeasureConvergence(Task):
         bundles = [build_bundle(journeys, maps, start, config) for start in (first, far)]
         for rows in outliers(bundles[0].corners, generator):
             bundles.append(build_bundle(journeys, maps, first, config))
-            bundles[-1].corners = rows
+            bundles[-1].see(rows)
         clean, from_far, with_outliers, without = (
             _adjusted(bundle, first, journeys) for bundle in bundles
         )

@@ -126,7 +126,7 @@ def with_boxes(bundle: Bundle, share: float, seed: int) -> Bundle:
     matrix[:, :2] -= error[..., None] * rows.matrix[:, 2:]
     number = rows.detection + is_centre
     observed = {"px": rows.px + error, "matrix": matrix, "loose_px": loose, "detection": number}
-    changed.corners = replace(rows, **observed)
+    changed.see(replace(rows, **observed))
     changed.given_up = torch.zeros(int(number.max()) + 1, dtype=torch.bool)
     return changed
 
