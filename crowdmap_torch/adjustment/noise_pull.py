@@ -9,7 +9,7 @@ leave half a log-determinant, which rises as much: of errors that are as large a
     d/d log(distance) of  1/2 log det A  =  - tr(P J^T W J) over the positions,
 
 with A = P^-1 the information on a frame's pose and J^T W J that of a detection on it. How large the errors really are the
-estimates tell: w . g of a detection, with w the position's error and g the gradient of the detection's cost along it, is
+estimates tell: -w . g of a detection, with w the position's error and g the gradient of the detection's cost along it, is
 what the cost falls by as that sign alone comes nearer. A drive's detections are held off by as much, in proportion to the
 traces; what one of them pulls with is mostly chance.
 """
