@@ -48,7 +48,7 @@ class RowGroups:
 
 def _runs(group: Int[Tensor, " m"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " g"], slice]:
     """Groups that follow on each other, counted from the first on; the first row of each; and which they are."""
-    first, last = int(group[0]), int(group[-1])
+    first, last = torch.stack((group[0], group[-1])).tolist()
     begins = torch.ones_like(group, dtype=torch.bool)
     begins[1:] = group[1:] != group[:-1]
     return group - first, torch.nonzero(begins)[:, 0], slice(first, last + 1)
