@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections
-from crowdmap_torch.optim.linearize import chunks, row_blocks
+from crowdmap_torch.optim.linearize import first_blocks
 from crowdmap_torch.optim.problem import CostTerm, Follows, Values, Variable
 from crowdmap_torch.processes.sums import add_at
 
@@ -48,7 +48,8 @@ def held_off(
     """
     (_, frame), (_, sign), *_ = term.slots
     frame, sign = frame[detections.first], sign[detections.first]
-    gradient, information = _of_detections(term, detections, variables, values)
+    runs = detections.run, len(detections.count)
+    _, gradient, information = first_blocks(term, variables, values, *runs)
     trace = (covariance[frame] * information).sum(-1)[:, _POSITION].sum(-1).clamp_min(0)
     work = -(error[frame] * gradient)[:, _POSITION].sum(-1)
     whose, both = journey[detections.first], torch.stack((work, trace), dim=1)
@@ -57,20 +58,6 @@ def held_off(
     share = (of_journeys[:, 0] / of_journeys[:, 1].clamp_min(least)).clamp(0, 1)
     distance = (values["sign"][sign, :3, 3] - values["pose"][frame, :3, 3]).norm(dim=-1)
     return (share[whose] * trace).sqrt() * distance
-
-
-def _of_detections(
-    term: CostTerm, detections: CornerDetections, variables: Mapping[str, Variable], values: Values
-) -> tuple[Float[Tensor, "d 6"], Float[Tensor, "d 6 6"]]:
-    """Each detection's gradient of the cost by its frame's pose, and its information on that."""
-    count, size = len(detections.count), variables["pose"].tangent_dim
-    gradient = values["pose"].new_zeros(count, size)
-    information = gradient.new_zeros(count, size * size)
-    for at, piece in chunks(term):
-        blocks, run = row_blocks(piece, variables, values, slots=1), detections.run[at]
-        add_at(gradient, 0, run, blocks.gradient[0].mT)
-        add_at(information, 0, run, blocks.hessian[0, 0].flatten(0, 1).mT)
-    return gradient, information.view(count, size, size)
 
 
 def noise_pull_term(

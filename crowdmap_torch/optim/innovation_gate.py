@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import chdtri
 from torch import Tensor
 
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, at_once, chunks, row_blocks
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, at_once, first_blocks
 from crowdmap_torch.optim.problem import CostTerm, Values, Variable
 from crowdmap_torch.optim.robust import JointTukey, Quadratic
 from crowdmap_torch.processes.sums import add_at
@@ -60,19 +60,13 @@ def innovations(
     assert isinstance(loss, JointTukey)
     run = loss.run
     count = torch.bincount(run)
-    n, k = len(count), covariance.shape[-1]
-    s = covariance.new_zeros(len(run))
-    gradient = covariance.new_zeros(n, k)
-    matrix = covariance.new_zeros(n, k * k)
-    for at, piece in chunks(replace(term, loss=Quadratic())):
-        blocks = row_blocks(piece, variables, values, slots=1)
-        s[at] = blocks.rho
-        add_at(gradient, 0, run[at], blocks.gradient[0].mT)
-        add_at(matrix, 0, run[at], blocks.hessian[0, 0].flatten(0, 1).mT)
+    n = len(count)
+    plain = replace(term, loss=Quadratic())
+    s, gradient, matrix = first_blocks(plain, variables, values, run, n)
     square = add_at(s.new_zeros(n), 0, run, s)
     first = count.cumsum(0) - count
     weight, block = loss.weight(s)[first], term.slots[0][1][first]
-    matrix, gradient = matrix.view(n, k, k), gradient[..., None]
+    gradient = gradient[..., None]
 
     def normalised(at: Int[Tensor, " m"]) -> Float[Tensor, " m"]:
         counted, of_rows, pull = weight[at, None, None], matrix[at], gradient[at]

@@ -187,6 +187,26 @@ def row_blocks(
     return RowBlocks(rho, _pulled(jacobians, residual * weight), hessian)
 
 
+def first_blocks(
+    term: CostTerm,
+    variables: Mapping[str, Variable],
+    values: Values,
+    run: Int[Tensor, " m"],
+    count: int,
+) -> tuple[Float[Tensor, " m"], Float[Tensor, "n k"], Float[Tensor, "n k k"]]:
+    """Losses of all rows, and gradient and Hessian block of the first slot, added up over `count` runs of rows."""
+    k = variables[term.slots[0][0]].tangent_dim
+    like = next(iter(values.values()))
+    rho, gradient = like.new_zeros(len(run)), like.new_zeros(count, k)
+    matrix = like.new_zeros(count, k * k)
+    for at, piece in chunks(term):
+        blocks = row_blocks(piece, variables, values, slots=1)
+        rho[at] = blocks.rho
+        add_at(gradient, 0, run[at], blocks.gradient[0].mT)
+        add_at(matrix, 0, run[at], blocks.hessian[0, 0].flatten(0, 1).mT)
+    return rho, gradient, matrix.view(count, k, k)
+
+
 def row_gradients(term: CostTerm, variables: Mapping[str, Variable], values: Values) -> RowBlocks:
     """Every row's gradient, without Hessian blocks."""
     residual, jacobians, weight, rho = _weighted(term, variables, values)
