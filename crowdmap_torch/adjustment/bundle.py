@@ -12,10 +12,11 @@ from crowdmap_torch.adjustment import calibration_priors
 from crowdmap_torch.adjustment.bundle_state import BundleState
 from crowdmap_torch.adjustment.calibration_scales import rescaled as rescaled_calibrations
 from crowdmap_torch.adjustment.config import AdjustConfig
+from crowdmap_torch.adjustment.detection_shifts import shift_innovations, told_apart
 from crowdmap_torch.adjustment.landmark_terms import about_usual_size, size_class_term, slide_term
 from crowdmap_torch.adjustment.lane_matching import follow
 from crowdmap_torch.adjustment.lane_terms import lane_point_terms
-from crowdmap_torch.adjustment.noise_pull import held_off, noise_pull_term
+from crowdmap_torch.adjustment.noise_pull import held_off, left_by_prior, noise_pull_term
 from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.adjustment.parts import Observations, Priors, SharedOut, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
@@ -58,8 +59,10 @@ _TOLD_HOLDS = 0.02
 """What observations tell of poses' errors is found anew where any scale has changed by more than this share since."""
 _WHITE_RESTS = 0.03
 """A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
-_LASTING_RESTS = 0.1
+_LASTING_RESTS = 0.2
 """The variance of a detection's shift that would change by less than this share is at rest."""
+_SHARE_RESTS = 0.2
+"""The share of poses' errors that is there is at rest where it changes by less than this: by as much of a small pull."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,8 @@ class Evidence(PoseEvidence):
 
     held_off: Float[Tensor, " d"]
     """By detection of corners (`noise_pull`)."""
+    innovation: Float[Tensor, "d 3"]
+    """Likewise (`detection_shifts`)."""
 
 
 class Bundle(BundleState):
@@ -149,13 +154,16 @@ class Bundle(BundleState):
             self.match_t, self.match_normal = found.t, found.normal_px
             self.match_valid = found.valid
         self.relinearise()
-        at_rest = self._narrow(values)
+        foreseen = False
+        if evidence is not None and evidence.told is not self.drift_told:
+            foreseen = True
+            self.told_at.copy_(made_with)
+            self.drift_told.copy_(evidence.told)
+            self.poses_left.copy_(evidence.left)
+            self.held_off.copy_(evidence.held_off)
+            self.innovation.copy_(evidence.innovation)
+        at_rest = self._narrow(values, foreseen)
         if evidence is not None:
-            if evidence.told is not self.drift_told:
-                self.told_at.copy_(made_with)
-                self.drift_told.copy_(evidence.told)
-                self.poses_left.copy_(evidence.left)
-                self.held_off.copy_(evidence.held_off)
             at_rest &= self._rescale_noise(values, evidence)
         if of_border is not None:
             scaled = self.fleet, values, of_border, self.calibration_scales
@@ -177,22 +185,23 @@ class Bundle(BundleState):
     def evidence(self) -> Evidence | None:
         """What was found last, as long as the scales are what it was found by; None: it is to be found anew."""
         holds = torch.isclose(self.scales(), self.told_at, rtol=_TOLD_HOLDS, atol=0)
-        found = self.drift_told, self.poses_left, self.held_off
+        found = self.drift_told, self.poses_left, self.held_off, self.innovation
         return Evidence(*found) if bool(holds.all()) else None
 
     def told_by(self, equations: MapEquations, corners: CostTerm | None) -> Evidence:
         """What normal equations solved at the bundle's scales, and their term of `corners`, tell of poses' errors."""
         told, left, off = torch.zeros_like(self.drift_told), self.poses_left, self.held_off
+        innovation = self.innovation
         if len(left):
             found = pose_evidence(self.prior, equations, self.prior_scale)
             told, left = found.told, found.left
         if corners is not None and len(off) and self.config.method != "paper2017":
-            values = self.values()
-            seen = corners, self.detections, self.variables, values
+            seen = corners, self.detections, self.variables, self.values()
             of_pose = equations.conditional_covariance("pose")
-            error = whitened_residuals(replace(self._white_term(), weight=None), values)
-            off = held_off(*seen, of_pose, error, self.corners.journey, len(told))
-        return Evidence(self._of_journeys(told), left, off)
+            by_prior = left_by_prior(equations, of_pose)
+            off = held_off(*seen, by_prior, self.corners.journey, len(told))
+            innovation = shift_innovations(*seen, of_pose, by_prior)
+        return Evidence(self._of_journeys(told), left, off, innovation)
 
     def _white_term(self) -> CostTerm:
         """Of poses' errors from frame to frame."""
@@ -249,8 +258,11 @@ class Bundle(BundleState):
         self.given_up.copy_(given_up)
         return first or changed
 
-    def _narrow(self, values: dict[str, Tensor]) -> bool:
-        """Narrows the scales of pixels to what the residuals show; returns whether they have come to rest."""
+    def _narrow(self, values: dict[str, Tensor], foreseen: bool) -> bool:
+        """Narrows the scales of pixels to what the residuals show; returns whether they have come to rest.
+
+        What detections have wrong together is told where they were `foreseen` anew.
+        """
         of_corners, of_lanes = self.scale.new_zeros(0, 2), self.scale[:0]
         for term in self._corner_term(1.0).values():
             of_corners = whitened_residuals(term, values)
@@ -264,8 +276,13 @@ class Bundle(BundleState):
         self.small_box.copy_(torch.where(narrows[0], small_box, self.small_box))
         if bool(narrows.any()):
             return False
-        lasting, rests = self.together.of_all(self._seen_lasting, of_corners)
+        if not foreseen or self.config.method == "paper2017":
+            return True
+        lasting, share, rests = self.together.of_all(
+            self._seen_lasting, of_corners, self.innovation
+        )
         self.lasting.copy_(lasting)
+        self.share_there.copy_(share)
         return rests
 
     def _seen_scales(
@@ -280,17 +297,32 @@ class Bundle(BundleState):
         errors = PixelErrors(whole.corners, of_corners, *lanes)
         return pixel_scales(errors, self.small_box, self.config)
 
-    def _seen_lasting(self, of_corners: Float[Tensor, "m 2"]) -> tuple[Float[Tensor, ""], bool]:
-        """What lasts of detections' shifts by the errors of all corners, and whether it has come to rest."""
-        if not len(of_corners) or self.config.method == "paper2017":
-            return self.lasting, True
+    def _seen_lasting(
+        self, of_corners: Float[Tensor, "m 2"], innovation: Float[Tensor, "d 3"]
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], bool]:
+        """What lasts of detections' shifts by the errors of all, what share of poses' is there, and whether both rest.
+
+        From the second time on either goes half of the way to where it is found: it is found by what it was.
+        """
+        if not len(of_corners):
+            return self.lasting, self.share_there, True
         rows, detections = self.whole.corners, self.whole.detections
         # Corners of boxes tell little of it, and would hide that of outlines; the centre of a box counts.
-        counted = ~self.given_up[rows.detection] & (rows.loose_px == 0)
-        seen = lasting_variance(detections, of_corners, self._sigma_of(rows), counted)
-        white = self.scale[0].square() / detections.most
-        rests = (seen - self.lasting).abs() <= _LASTING_RESTS * (seen + white)
-        return torch.where(rests, self.lasting, seen), bool(rests)
+        used = detections.have(~self.given_up[rows.detection] & (rows.loose_px == 0))
+        noise = detections.mean(self._sigma_of(rows).square()[:, None])[:, 0] / detections.count
+        of_each, share = told_apart(innovation, noise, used)
+        # Errors that are larger than they are taken to be are so until the scales have found them.
+        share = share.clamp_max(1.0)
+        lasting = lasting_variance(detections, of_corners, used, of_each)
+        moved = (lasting - self.lasting).abs()
+        lasting_rests = moved <= _LASTING_RESTS * (lasting + noise.mean())
+        share_rests = (share - self.share_there).abs() <= _SHARE_RESTS
+        far = torch.where(self.share_there == 1, 1.0, 0.5)
+        return (
+            torch.where(lasting_rests, self.lasting, torch.lerp(self.lasting, lasting, far)),
+            torch.lerp(self.share_there, share, far),
+            bool(lasting_rests & share_rests),
+        )
 
     def problem(self) -> Problem:
         """The least-squares problem with the matches and scales of the moment, lanes held where they are.
@@ -378,7 +410,8 @@ class Bundle(BundleState):
         if not len(self.corners) or self.config.method == "paper2017":
             return {}
         rows, first = self.corners, self.detections.first
-        return {"noise_pull": noise_pull_term(rows.frame[first], rows.sign[first], self.held_off)}
+        strength = (1 - self.share_there).clamp_min(0).sqrt() * self.held_off
+        return {"noise_pull": noise_pull_term(rows.frame[first], rows.sign[first], strength)}
 
     def _slide_term(self) -> dict[str, CostTerm]:
         if not len(self.lane_points):

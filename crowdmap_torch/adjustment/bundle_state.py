@@ -65,9 +65,13 @@ class BundleState(nn.Module):
     poses_left: Tensor
     """Variance that is left of every pose's deviation from its drift."""
     held_off: Tensor
-    """By detection of corners, how strongly its sign and its camera are held off each other [m] (`noise_pull`)."""
+    """By detection of corners, how strongly its sign and its camera are held off each other [m] at most (`noise_pull`)."""
+    innovation: Tensor
+    """By detection of corners, how far all else foresees it shifted, and by what (`detection_shifts`)."""
+    share_there: Tensor
+    """Share of the variances of poses' errors, as they are taken for, that is there."""
     told_at: Tensor
-    """The scales by which all three were found; NaN before."""
+    """The scales by which all these were found; NaN before."""
 
     def __init__(
         self,
@@ -114,6 +118,8 @@ class BundleState(nn.Module):
         self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
         self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
         self.register_buffer("held_off", values["pose"].new_zeros(0))
+        self.register_buffer("innovation", values["pose"].new_zeros(0, 3))
+        self.register_buffer("share_there", torch.ones_like(self.lasting))
         self.register_buffer("told_at", torch.full_like(self.scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         # Their matrices are the bundle's own: lenses are taken anew in place.
@@ -208,6 +214,7 @@ class BundleState(nn.Module):
         """Takes these corners of signs for those that were seen; nothing is held off by their detections yet."""
         self.corners = corners
         self.held_off = self.scale.new_zeros(len(self.detections.count))
+        self.innovation = self.scale.new_zeros(len(self.held_off), 3)
 
     def rest(self) -> None:
         """Puts the observations, which others have, into a file, and forgets what follows from them until `relinearise`."""

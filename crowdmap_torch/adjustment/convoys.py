@@ -38,7 +38,7 @@ from crowdmap_torch.processes.together import Member, Together
 
 _OWN = ("pose", "drift")
 """The unknowns that each convoy has of its own drives alone."""
-_ROWS = ("match_t", "match_normal", "match_valid", "poses_left", "held_off")
+_ROWS = ("match_t", "match_normal", "match_valid", "poses_left", "held_off", "innovation")
 """What a bundle keeps of each lane point, of each pose, and of each detection of a sign."""
 
 
@@ -82,7 +82,8 @@ def convoy(bundle: Bundle, state: LmState | None, first: int, last: int) -> Conv
     is_here = (beside >= 0) & (bundle.beside < of_poses.stop)
     kept = {k: v for k, v in bundle.state_dict().items() if k not in bundle.unknown_names}
     of_sign = corner[bundle.detections.first]
-    rows = dict.fromkeys(_ROWS, point) | {"poses_left": of_poses, "held_off": of_sign}
+    rows = dict.fromkeys(_ROWS, point) | {"poses_left": of_poses}
+    rows |= dict.fromkeys(("held_off", "innovation"), of_sign)
     kept |= {name: kept[name][of] for name, of in rows.items()}
 
     def of_all(name: str, value: Tensor) -> Tensor:

@@ -1,17 +1,19 @@
-"""How poses' noise pulls signs near, and what holds them off: the bias of estimating what every frame has to itself.
+"""How noise of images pulls signs near where poses err less than they are taken to, and what holds them off.
 
-Each frame has an error of its pose to itself, white noise, that is estimated beside the map (Neyman and Scott, Consistent
-estimates based on partially consistent observations, 1948). It takes up image noise: an angle is noise of the image or,
-times the distance, of the position. The nearer the signs the smaller are the errors that it takes, so that the cost of
-these falls with the scale of the map, however many frames there are. Integrated out, as the map's likelihood has them, they
-leave half a log-determinant, which rises as much: of errors that are as large as they are taken to be,
+What a pose is wrong by is estimated beside the map, and noise of the image is taken in part for it: an angle is noise of
+the image or, times the distance, of the position. The nearer the signs the smaller are the errors that it makes, so that
+the cost of these falls with the scale of the map, however many frames there are (Neyman and Scott, Consistent estimates
+based on partially consistent observations, 1948). True errors of the given poses do not: from where a camera was said to
+be a nearer sign is seen off by more, which is as much dearer. With residuals y of the given poses, of noise R, errors of
+variance B and their Jacobian J, which goes with one over the distance, the cost is y^T S^-1 y / 2 with S = R + J B J^T.
+Where the errors' true variance is tau B, the mean of its slope by log(distance) is
 
-    d/d log(distance) of  1/2 log det A  =  - tr(P J^T W J) over the positions,
+    (1 - tau) tr(S^-1 J B J^T S^-1 R)  =  (1 - tau) tr(Q J^T R^-1 J),        Q = P B^-1 P,
 
-with A = P^-1 the information on a frame's pose and J^T W J that of a detection on it. How large the errors really are the
-estimates tell: -w . g of a detection, with w the position's error and g the gradient of the detection's cost along it, is
-what the cost falls by as that sign alone comes nearer. A drive's detections are held off by as much, in proportion to the
-traces; what one of them pulls with is mostly chance.
+with P = (B^-1 + J^T R^-1 J)^-1 the covariance of the errors' estimates, and Q what of it is the prior's: the rest is noise
+of images. There is no pull where all errors are as large as they are taken to be (tau = 1), as in structural relations
+with errors in both variables (Fuller, Measurement error models, 1987). Signs are held off by the slope, detection by
+detection; `detection_shifts` has tau.
 """
 
 from __future__ import annotations
@@ -25,10 +27,24 @@ from torch import Tensor
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections
 from crowdmap_torch.optim.linearize import first_blocks
 from crowdmap_torch.optim.problem import CostTerm, Follows, Values, Variable
+from crowdmap_torch.optim.solvers.normal_equations import MapEquations
 from crowdmap_torch.processes.sums import add_at
 
 _POSITION = slice(0, 3)
 """The numbers of a pose's tangent that are its position's."""
+_MORE = 1e-4
+"""Share by which observations are to tell more where covariances are differenced."""
+
+
+def left_by_prior(
+    equations: MapEquations, covariance: Float[Tensor, "p 6 6"]
+) -> Float[Tensor, "p 6 6"]:
+    """Q: what errors of the prior leave of the `covariance` of each pose, P + dP/ds with observations that tell s times.
+
+    With all else known, as P = `conditional_covariance` of normal equations.
+    """
+    more = equations.conditional_covariance("pose", told=1 + _MORE)
+    return covariance + (more - covariance) / _MORE
 
 
 def held_off(
@@ -36,28 +52,27 @@ def held_off(
     detections: CornerDetections,
     variables: Mapping[str, Variable],
     values: Values,
-    covariance: Float[Tensor, "p 6 6"],
-    error: Float[Tensor, "p 6"],
+    by_prior: Float[Tensor, "p 6 6"],
     journey: Int[Tensor, " m"],
     journeys: int,
 ) -> Float[Tensor, " d"]:
-    """The `strength` of `noise_pull_term` of every detection that undoes the pull at these values [m].
+    """The `strength` of `noise_pull_term` of every detection that undoes the pull at tau = 0 [m].
 
-    `term` is that of the detections' corners, by camera and sign; `covariance` that of each pose, with all else known,
-    `error` what it has wrong to itself, and `journey` of so many `journeys` each row's.
+    `term` is that of the detections' corners, by camera and sign; `by_prior` is Q of each pose, and `journey` of so many
+    `journeys` each row's. A detection that pulls the other way, where turns make up for positions, has none, and all
+    others of its journey so much less.
     """
     (_, frame), (_, sign), *_ = term.slots
     frame, sign = frame[detections.first], sign[detections.first]
     runs = detections.run, len(detections.count)
-    _, gradient, information = first_blocks(term, variables, values, *runs)
-    trace = (covariance[frame] * information).sum(-1)[:, _POSITION].sum(-1).clamp_min(0)
-    work = -(error[frame] * gradient)[:, _POSITION].sum(-1)
-    whose, both = journey[detections.first], torch.stack((work, trace), dim=1)
-    of_journeys = add_at(both.new_zeros(journeys, 2), 0, whose, both)
-    least = torch.finfo(both.dtype).tiny
-    share = (of_journeys[:, 0] / of_journeys[:, 1].clamp_min(least)).clamp(0, 1)
+    _, _, information = first_blocks(term, variables, values, *runs)
+    slope = (by_prior[frame] * information).sum(-1)[:, _POSITION].sum(-1)
+    whose, both = journey[detections.first], torch.stack((slope, slope.clamp_min(0)), dim=1)
+    every = add_at(both.new_zeros(journeys, 2), 0, whose, both)
+    share = (every[:, 0] / every[:, 1].clamp_min(torch.finfo(both.dtype).tiny)).clamp_min(0)
+    slope = share[whose] * both[:, 1]
     distance = (values["sign"][sign, :3, 3] - values["pose"][frame, :3, 3]).norm(dim=-1)
-    return (share[whose] * trace).sqrt() * distance
+    return slope.sqrt() * distance
 
 
 def noise_pull_term(

@@ -42,6 +42,10 @@ class CornerDetections:
     follower: Int[Tensor, " d"]
     """The next detection of each one's sign in its journey; -1: there is none."""
 
+    def have(self, counted: Bool[Tensor, " m"]) -> Bool[Tensor, " d"]:
+        """The detections of which all rows are counted."""
+        return self.mean(counted.double()[:, None])[:, 0] == 1
+
     def mean(self, residual: Float[Tensor, "m k"]) -> Float[Tensor, "d k"]:
         """What the rows of each detection have in common."""
         return group_sum(residual, self.run, len(self.count)) / self.count[:, None]
@@ -96,25 +100,21 @@ def shared_errors(
 def lasting_variance(
     detections: CornerDetections,
     residual: Float[Tensor, "m 2"],
-    sigma: Float[Tensor, " m"],
-    counted: Bool[Tensor, " m"],
+    used: Bool[Tensor, " d"],
+    of_each: Float[Tensor, ""],
 ) -> Float[Tensor, ""]:
-    """Variance of the mean of many successive shifts, times their number, beyond that of white noise [px^2].
+    """Variance of the mean of many successive shifts, times their number [px^2], with that `of_each` alone.
 
-    Of pixel errors and the noise of each corner; rows that are not `counted` are left out. The sum of the covariances of
-    detections ever further apart in their tracks, as long as they are positive (Geyer, Practical Markov Chain Monte Carlo,
-    1992).
+    Of pixel errors; detections that are not `used` are left out. The sum of the covariances of detections ever further
+    apart in their tracks, as long as they are positive (Geyer, Practical Markov Chain Monte Carlo, 1992).
     """
-    white = detections.mean(sigma.square()[:, None])[:, 0] / detections.count
-    used = detections.mean(counted.to(residual)[:, None])[:, 0] == 1
     shift = detections.mean(residual)
-    zero = white.new_zeros(())
     if not bool(used.any()):
-        return zero
+        return torch.zeros_like(of_each)
     bound = _CLIP * torch.stack([median_scale(x) for x in shift[used].unbind(1)])
     shift = torch.where(used[:, None], torch.minimum(torch.maximum(shift, -bound), bound), 0.0)
-    total = shift[used].square().mean() - white[used].mean()
-    later, goes_on = detections.follower, torch.ones_like(zero)
+    total, goes_on = of_each, torch.ones_like(of_each)
+    later = detections.follower
     for _ in range(_MOST_LAGS):
         pairs = (later >= 0) & used & used[later]
         together = (shift * shift[later] * pairs[:, None]).sum() / (2 * pairs.sum()).clamp_min(1)

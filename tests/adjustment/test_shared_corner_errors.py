@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.bundle import Bundle, Evidence
 from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.adjustment.shared_corner_errors import (
     corner_detections,
@@ -63,21 +63,25 @@ def errors(shift: float, lasts: float, seed: int) -> Tensor:
 @pytest.mark.parametrize(("shift", "lasts"), [(0.0, 0.0), (0.7, 0.0), (0.7, 0.8)])
 def test_what_lasts_is_the_variance_of_long_means(shift: float, lasts: float, seed: int):
     table = rows()
-    sigma = torch.full((len(table),), 0.5, dtype=F64)
-    counted = torch.ones(len(table), dtype=torch.bool)
-    found = lasting_variance(corner_detections(table), errors(shift, lasts, seed), sigma, counted)
+    used = torch.ones(len(table) // _CORNERS, dtype=torch.bool)
+    of_each = torch.tensor(shift**2, dtype=F64)
+    error = errors(shift, lasts, seed)
+    found = lasting_variance(corner_detections(table), error, used, of_each)
     expected = shift**2 * (1 + lasts) / (1 - lasts)
     assert abs(float(found) - expected) < 0.25 * expected + 0.03
 
 
 def test_outliers_and_what_is_given_up_do_not_matter():
     table, error = rows(), errors(0.0, 0.0, 0)
-    sigma = torch.full((len(table),), 0.5, dtype=F64)
+    detections = corner_detections(table)
     wild = table.detection % 40 == 0
     error[wild] += 30.0
     for counted in (~wild, torch.ones_like(wild)):
-        found = lasting_variance(corner_detections(table), error, sigma, counted)
+        used = detections.have(counted)
+        assert int(used.sum()) == int(counted.sum()) // _CORNERS
+        found = lasting_variance(detections, error, used, torch.zeros((), dtype=F64))
         assert float(found) < 0.15
+    assert not lasting_variance(detections, error, used & False, torch.ones((), dtype=F64))
 
 
 def test_detections_of_other_signs_drives_and_kinds_do_not_follow_each_other():
@@ -128,7 +132,20 @@ def with_boxes(bundle: Bundle, share: float, seed: int) -> Bundle:
     observed = {"px": rows.px + error, "matrix": matrix, "loose_px": loose, "detection": number}
     changed.see(replace(rows, **observed))
     changed.given_up = torch.zeros(int(number.max()) + 1, dtype=torch.bool)
+    changed.lasting.zero_()
+    # As if poses were known: each shift is its own innovation.
+    known = torch.full((len(changed.innovation), 2), 1e-6, dtype=F64)
+    square = changed.detections.mean(error).square().mean(1)
+    changed.innovation = torch.cat((square[:, None], known), dim=1)
     return changed
+
+
+def foreseen(bundle: Bundle) -> Evidence:
+    """What its observations are said to tell, as if it was found anew."""
+    told, off, innovation = (
+        x.clone() for x in (bundle.drift_told, bundle.held_off, bundle.innovation)
+    )
+    return Evidence(told, bundle.poses_left.clone(), off, innovation)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -138,7 +155,8 @@ def test_loose_corners_of_boxes_do_not_hide_what_lasts(adjusted: Adjusted, share
     tight = deepcopy(mixed)
     tight.given_up[mixed.corners.detection[mixed.corners.loose_px > 0]] = True
     for bundle in (mixed, tight):
-        bundle.refresh()
+        bundle.share_there.fill_(1.0)
+        bundle.refresh(foreseen(bundle))
     # Five pushes of 0.4 px in each shift: 4 px^2 in the mean of many, less where centres follow each other with gaps.
     assert 1.0 < float(tight.lasting) < 7.0
     torch.testing.assert_close(mixed.lasting, tight.lasting)

@@ -218,9 +218,10 @@ class ChainNormalEquations:
         """The chains, by what the rounds of every part leave behind, and what binds them to what stays."""
         return ChainBorder(self.structure, self.coupling, self.border_link, leads)
 
-    def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
+    def conditional_covariance(self, name: str, *, told: float = 1.0) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, the landmarks known."""
-        found = self.known.of_blocks()
+        known = self.known if told == 1.0 else self._known_if(told)
+        found = known.of_blocks()
         return self.structure.unstack(found)[name][..., : self.structure.width[name]]
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
@@ -245,6 +246,15 @@ class ChainNormalEquations:
         leads = factor.leads if factor is not None and is_own and factor.is_undamped else None
         blocks = self.structure, self.diagonal, self.link, self.coupling, self.hessian
         return KnownLandmarks.of(*blocks, leads)
+
+    def _known_if(self, told: float) -> KnownLandmarks:
+        """The same if what leaves see told so many times as much; their prior is what binds them to their carriers."""
+        plan, diagonal = self.structure.plan, self.diagonal.clone()
+        assert plan.leaves is not None
+        leaf, k = slice(0, plan.leaf_count), self.structure.width[plan.leaves]
+        seen = self.diagonal[leaf, :k, :k] + self.link[leaf, :k, :k]
+        diagonal[leaf, :k, :k] += (told - 1) * (seen + seen.mT) / 2
+        return KnownLandmarks.of(self.structure, diagonal, self.link, self.coupling, self.hessian)
 
     def factorise(
         self, added_x: Float[Tensor, "e k"], added_y: Float[Tensor, " r"]

@@ -277,9 +277,9 @@ class JourneyEquations:
         chains = self.own.chains(factor.leads)
         return self.together.for_leader(_all_sums, _own_sums(chains, weight, of, count))
 
-    def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
+    def conditional_covariance(self, name: str, *, told: float = 1.0) -> Float[Tensor, "n k k"]:
         """Covariance of every block of one's own, the landmarks known."""
-        return self.own.conditional_covariance(name)
+        return self.own.conditional_covariance(name, told=told)
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
         """Variance of each own leaf's numbers less those of the block that carries it, landmarks and border known."""

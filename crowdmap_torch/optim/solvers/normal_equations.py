@@ -255,8 +255,11 @@ class MapEquations(NormalEquations, Protocol):
         """The inverse of the Hessian, undamped."""
         ...
 
-    def conditional_covariance(self, name: str) -> Float[Tensor, "n k k"]:
-        """Covariance of every block of an eliminated variable, landmarks and border known."""
+    def conditional_covariance(self, name: str, *, told: float = 1.0) -> Float[Tensor, "n k k"]:
+        """Covariance of every block of an eliminated variable, landmarks and border known.
+
+        As if observations told so many times as much as they do, of chains whose leaves alone observe.
+        """
         ...
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:

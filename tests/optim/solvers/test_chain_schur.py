@@ -435,3 +435,22 @@ def test_leaves_vary_about_what_carries_them_as_the_dense_inverse_says():
     P = covariance_of(built, values, "pose", "drift")
     expected = (less @ P @ less.T).diagonal().view(n, 3)
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("told", [0.5, 1.0, 2.0])
+def test_leaves_that_see_more_are_known_as_the_dense_inverse_says(told: float):
+    built, values, chain = problem([12, 7])
+    n = len(chain)
+    built, values = on_drift(built, values, chain)
+    plan = in_parts(EliminationPlan("drift", chain, "pose", torch.arange(n)), 2)
+    found = ChainBackend(plan).assemble(built, values).conditional_covariance("pose", told=told)
+    bound = {name: term for name, term in built.terms.items() if "drift" in dict(term.slots)}
+    every, prior = (
+        DenseBackend().assemble(replace(built, terms=terms), values).hessian[0]
+        for terms in (built.terms, bound)
+    )
+    at = DenseBackend().assemble(built, values).where.offset
+    rows = torch.cat([at[name][:, None] + torch.arange(3) for name in ("pose", "drift")]).flatten()
+    hessian = (prior + told * (every - prior))[rows[:, None], rows]
+    P, each = torch.linalg.inv(hessian)[: 3 * n, : 3 * n].view(n, 3, n, 3), torch.arange(n)
+    torch.testing.assert_close(found, P[each, :, each], rtol=1e-8, atol=1e-12)
