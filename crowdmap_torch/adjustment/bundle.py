@@ -25,6 +25,7 @@ from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, pose_evidence, white_scales
 from crowdmap_torch.noise.pose_prior import CUT_TERMS, WANDER_SCALE
 from crowdmap_torch.optim.innovation_gate import innovations
+from crowdmap_torch.optim.linearize import first_blocks
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
 from crowdmap_torch.optim.problem import CostTerm, Problem
 from crowdmap_torch.optim.robust import JointTukey, Tukey
@@ -196,11 +197,15 @@ class Bundle(BundleState):
             found = pose_evidence(self.prior, equations, self.prior_scale)
             told, left = found.told, found.left
         if corners is not None and len(off) and self.config.method != "paper2017":
-            seen = corners, self.detections, self.variables, self.values()
+            values, detections = self.values(), self.detections
+            runs = detections.run, len(off)
+            _, gradient, tells = first_blocks(corners, self.variables, values, *runs)
             of_pose = equations.conditional_covariance("pose")
             by_prior = left_by_prior(equations, of_pose)
-            off = held_off(*seen, by_prior, self.corners.journey, len(told))
-            innovation = shift_innovations(*seen, of_pose, by_prior)
+            whose = self.corners.journey, len(told)
+            off = held_off(corners, detections, values, tells, by_prior, *whose)
+            seen = corners, detections, self.variables, values
+            innovation = shift_innovations(*seen, gradient, tells, of_pose, by_prior)
         return Evidence(self._of_journeys(told), left, off, innovation)
 
     def _white_term(self) -> CostTerm:

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections
-from crowdmap_torch.optim.linearize import CHUNK_ROWS, at_once, first_blocks, linearize, residuals
+from crowdmap_torch.optim.linearize import CHUNK_ROWS, at_once, linearize, residuals
 from crowdmap_torch.optim.problem import CostTerm, Values, Variable
 from crowdmap_torch.optim.robust import Quadratic
 from crowdmap_torch.residuals import reprojection
@@ -39,12 +39,15 @@ def shift_innovations(
     detections: CornerDetections,
     variables: Mapping[str, Variable],
     values: Values,
+    gradient: Float[Tensor, "d 6"],
+    information: Float[Tensor, "d 6 6"],
     covariance: Float[Tensor, "p 6 6"],
     by_prior: Float[Tensor, "p 6 6"],
 ) -> Float[Tensor, "d 3"]:
     """Of every detection the square of its shift's innovation, and what poses' errors and others' noise make of it [px^2].
 
-    Means of u and v. `term` is that of the detections' corners, by camera, sign and its size, at the minimum;
+    Means of u and v. `term` is that of the detections' corners, by camera, sign and its size, at the minimum; of
+    each detection there are the `gradient` by its pose and the `information` on it;
     `covariance` that of each pose, with all else known, and `by_prior` what of it the prior's errors leave. All three are
     zero where nothing tells: of detections that have no say.
     """
@@ -61,7 +64,6 @@ def shift_innovations(
     plain = replace(term, weight=None, shared=None, loss=Quadratic())
     shift = detections.mean(residuals(plain, values))
     by_pose = linearize(middle, variables, values).jacobians[0].movedim(-1, 0)
-    _, gradient, information = first_blocks(term, variables, values, detections.run, n)
 
     def of_some(at: Tensor) -> Float[Tensor, "m 3"]:
         J, own, of_pose = by_pose[at], information[at], covariance[frame[at]]

@@ -18,15 +18,12 @@ detection; `detection_shifts` has tau.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections
-from crowdmap_torch.optim.linearize import first_blocks
-from crowdmap_torch.optim.problem import CostTerm, Follows, Values, Variable
+from crowdmap_torch.optim.problem import CostTerm, Follows, Values
 from crowdmap_torch.optim.solvers.normal_equations import MapEquations
 from crowdmap_torch.processes.sums import add_at
 
@@ -50,22 +47,20 @@ def left_by_prior(
 def held_off(
     term: CostTerm,
     detections: CornerDetections,
-    variables: Mapping[str, Variable],
     values: Values,
+    information: Float[Tensor, "d 6 6"],
     by_prior: Float[Tensor, "p 6 6"],
     journey: Int[Tensor, " m"],
     journeys: int,
 ) -> Float[Tensor, " d"]:
     """The `strength` of `noise_pull_term` of every detection that undoes the pull at tau = 0 [m].
 
-    `term` is that of the detections' corners, by camera and sign; `by_prior` is Q of each pose, and `journey` of so many
-    `journeys` each row's. A detection that pulls the other way, where turns make up for positions, has none, and all
+    `term` is that of the detections' corners, by camera and sign, `information` what each tells of its pose, `by_prior`
+    Q of each pose, and `journey` of so many `journeys` each row's. A detection that pulls the other way, where turns make up for positions, has none, and all
     others of its journey so much less.
     """
     (_, frame), (_, sign), *_ = term.slots
     frame, sign = frame[detections.first], sign[detections.first]
-    runs = detections.run, len(detections.count)
-    _, _, information = first_blocks(term, variables, values, *runs)
     slope = (by_prior[frame] * information).sum(-1)[:, _POSITION].sum(-1)
     whose, both = journey[detections.first], torch.stack((slope, slope.clamp_min(0)), dim=1)
     every = add_at(both.new_zeros(journeys, 2), 0, whose, both)

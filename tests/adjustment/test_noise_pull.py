@@ -24,7 +24,7 @@ from crowdmap_torch.adjustment.parts import VARIABLES
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.optim.levenberg_marquardt import LmConfig
-from crowdmap_torch.optim.linearize import dense, residuals, row_blocks
+from crowdmap_torch.optim.linearize import dense, first_blocks, residuals, row_blocks
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.residuals.reprojection import sign_reprojection, sign_reprojection_jacobian
 
@@ -54,7 +54,9 @@ class Views:
     def strength(self, true_share: float = 0.0) -> Tensor:
         """At that share of the poses' errors."""
         by_prior = self.covariance @ torch.diag(SIGMA**-2) @ self.covariance
-        seen = self.term, self.detections, VARIABLES, self.values, by_prior
+        runs = self.detections.run, len(self.detections.count)
+        _, _, tells = first_blocks(self.term, VARIABLES, self.values, *runs)
+        seen = self.term, self.detections, self.values, tells, by_prior
         found = held_off(*seen, self.term.slots[0][1] * JOURNEYS // FRAMES, JOURNEYS)
         return (1 - true_share**2) ** 0.5 * found
 
