@@ -55,9 +55,9 @@ def held_off(
 ) -> Float[Tensor, " d"]:
     """The `strength` of `noise_pull_term` of every detection that undoes the pull at tau = 0 [m].
 
-    `term` is that of the detections' corners, by camera and sign, `information` what each tells of its pose, `by_prior`
-    Q of each pose, and `journey` of so many `journeys` each row's. A detection that pulls the other way, where turns make up for positions, has none, and all
-    others of its journey so much less.
+    `term` is that of the detections' corners, by camera and sign, `information` what each tells of its pose, `by_prior` Q
+    of each pose, and `journey` of so many `journeys` each row's. A detection that pulls the other way, where turns make up
+    for positions, has none, and all others of its journey so much less.
     """
     (_, frame), (_, sign), *_ = term.slots
     frame, sign = frame[detections.first], sign[detections.first]
