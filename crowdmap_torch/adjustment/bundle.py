@@ -76,6 +76,16 @@ class Evidence(PoseEvidence):
     """Likewise (`detection_shifts`)."""
 
 
+@dataclass(frozen=True)
+class AtRest:
+    """Which scales a refresh found to be at rest, and left all but as they were."""
+
+    scales: bool
+    """All of them."""
+    judging: bool
+    """Those that detections are judged by: of the noise of corners, of the poses' prior and of their noise."""
+
+
 class Bundle(BundleState):
     """The problem that unknowns and observations make, and how its scales follow from step to step."""
 
@@ -136,13 +146,14 @@ class Bundle(BundleState):
     @torch.no_grad()
     def refresh(
         self, evidence: Evidence | None = None, of_border: BorderInformation | None = None
-    ) -> bool:
-        """Matches lanes anew and narrows the scales; returns whether the scales have come to rest.
+    ) -> AtRest:
+        """Matches lanes anew and narrows the scales; returns which of them have come to rest.
 
         The scales of pixels start at what the residuals show, so that a wrong start does not make outliers of
         everything, and fall as the fit improves; they never grow again. What detections of a sign have wrong together is
-        told from zero on once they are at rest: before that it is the drift. Those of the poses' prior follow the drift and
-        the noise about it, as far as there is `evidence` of them, those of calibrations what `of_border` tells of cars.
+        told from zero on once that of corners is at rest: before that it is the drift. Those of the poses' prior follow the
+        drift and the noise about it, as far as there is `evidence` of them, those of calibrations what `of_border` tells
+        of cars.
         """
         values, made_with = self.values(), self.scales()
         if len(self.lane_points):
@@ -163,9 +174,9 @@ class Bundle(BundleState):
             self.poses_left.copy_(evidence.left)
             self.held_off.copy_(evidence.held_off)
             self.innovation.copy_(evidence.innovation)
-        at_rest = self._narrow(values, foreseen)
+        judging, at_rest = self._narrow(values, foreseen)
         if evidence is not None:
-            at_rest &= self._rescale_noise(values, evidence)
+            judging &= self._rescale_noise(values, evidence)
         if of_border is not None:
             scaled = self.fleet, values, of_border, self.calibration_scales
             of_cars = self.together.of_all(lambda: rescaled_calibrations(*scaled))
@@ -179,9 +190,9 @@ class Bundle(BundleState):
         )
         rests = torch.full_like(found, _SCALE_RESTS)
         rests[:, WANDER_SCALE:] = _WANDER_RESTS
-        at_rest &= self._follow("prior_scale", found, _SCALE_STAYS, rests)
+        judging &= self._follow("prior_scale", found, _SCALE_STAYS, rests)
         self.refreshed.fill_(True)
-        return at_rest
+        return AtRest(at_rest and judging, judging)
 
     def evidence(self) -> Evidence | None:
         """What was found last, as long as the scales are what it was found by; None: it is to be found anew."""
@@ -263,8 +274,8 @@ class Bundle(BundleState):
         self.given_up.copy_(given_up)
         return first or changed
 
-    def _narrow(self, values: dict[str, Tensor], foreseen: bool) -> bool:
-        """Narrows the scales of pixels to what the residuals show; returns whether they have come to rest.
+    def _narrow(self, values: dict[str, Tensor], foreseen: bool) -> tuple[bool, bool]:
+        """Narrows the scales of pixels to what the residuals show; whether those of corners and the others are at rest.
 
         What detections have wrong together is told where they were `foreseen` anew.
         """
@@ -279,16 +290,16 @@ class Bundle(BundleState):
         narrows = seen < _NARROWS * self.scale
         self.scale.copy_(torch.where(narrows, seen, self.scale))
         self.small_box.copy_(torch.where(narrows[0], small_box, self.small_box))
-        if bool(narrows.any()):
-            return False
-        if not foreseen or self.config.method == "paper2017":
-            return True
+        corners, *lanes = narrows.tolist()
+        if corners or not foreseen or self.config.method == "paper2017":
+            return not corners, not any(lanes)
         lasting, share, rests = self.together.of_all(
             self._seen_lasting, of_corners, self.innovation
         )
         self.lasting.copy_(lasting)
         self.share_there.copy_(share)
-        return rests
+        lasting_rests, share_rests = rests.tolist()
+        return lasting_rests, share_rests and not any(lanes)
 
     def _seen_scales(
         self,
@@ -304,13 +315,13 @@ class Bundle(BundleState):
 
     def _seen_lasting(
         self, of_corners: Float[Tensor, "m 2"], innovation: Float[Tensor, "d 3"]
-    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], bool]:
-        """What lasts of detections' shifts by the errors of all, what share of poses' is there, and whether both rest.
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Bool[Tensor, " 2"]]:
+        """What lasts of detections' shifts by the errors of all, what share of poses' is there, and whether each rests.
 
         From the second time on either goes half of the way to where it is found: it is found by what it was.
         """
         if not len(of_corners):
-            return self.lasting, self.share_there, True
+            return self.lasting, self.share_there, self.given_up.new_ones(2)
         rows, detections = self.whole.corners, self.whole.detections
         # Corners of boxes tell little of it, and would hide that of outlines; the centre of a box counts.
         used = detections.have(~self.given_up[rows.detection] & (rows.loose_px == 0))
@@ -326,7 +337,7 @@ class Bundle(BundleState):
         return (
             torch.where(lasting_rests, self.lasting, torch.lerp(self.lasting, lasting, far)),
             torch.lerp(self.share_there, share, far),
-            bool(lasting_rests & share_rests),
+            torch.stack((lasting_rests, share_rests)),
         )
 
     def problem(self) -> Problem:

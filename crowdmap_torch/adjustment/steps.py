@@ -37,8 +37,8 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     """One step of the solver, folded into the bundle, and whether the adjustment is finished.
 
     Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
-    first come to rest, and when the solver stops. It is finished when that changes nothing, or no more than is lost in how
-    little is known.
+    that they are judged by first come to rest, and when the solver stops. It is finished when that changes nothing, or no
+    more than is lost in how little is known.
     """
     problem = bundle.problem()
     normal = state.normal
@@ -57,14 +57,15 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     del corners
     of_border = normal.border_information() if bundle.fleet.kinds else None
     bundle.fold(dict(state.values))
-    at_rest = bundle.refresh(evidence, of_border)
-    if at_rest and (state.done or int(bundle.judged) == 0) and bundle.judge(normal):
+    found, first = bundle.refresh(evidence, of_border), int(bundle.judged) == 0
+    at_rest = found.scales
+    if (found.judging if first else at_rest and state.done) and bundle.judge(normal):
         if state.done:
             state = lm.settled(bundle.problem(), state, normal, bundle.config.lm)
-        at_rest = state.done
+        at_rest &= state.done
         if at_rest:
             bundle.fold(dict(state.values))
-            at_rest = bundle.refresh(evidence)
+            at_rest = bundle.refresh(evidence).scales
     if state.done and at_rest:
         return state, True
     return lm.changed(state), False

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from crowdmap_torch.adjustment import adjust, relinearisation
-from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.bundle import AtRest, Bundle
 from crowdmap_torch.adjustment.calibration import columns
 from crowdmap_torch.adjustment.lane_matching import follow
 from crowdmap_torch.adjustment.parts import Observations, Priors, Unknowns
@@ -279,8 +279,21 @@ def test_the_wander_of_biases_rests_while_it_moves_a_little(
     assert bundle.prior.wander is not None
     monkeypatch.setattr(PosePrior, "rescaled", lambda *_: bundle.prior_scale.clone())
     # Pixels narrow first.
-    assert any(bundle.refresh() for _ in range(10))
+    assert any(bundle.refresh().scales for _ in range(10))
     factor = torch.ones_like(bundle.prior_scale)
     factor[0, scale] = moves
     monkeypatch.setattr(PosePrior, "rescaled", lambda *_: factor * bundle.prior_scale)
-    assert bundle.refresh() == rests
+    assert bundle.refresh() == AtRest(rests, rests)
+
+
+@pytest.mark.parametrize(("scale", "judging"), [(0, False), (1, True), (2, True)])
+def test_detections_may_be_judged_while_what_they_are_not_judged_by_moves(
+    street: Street, monkeypatch: pytest.MonkeyPatch, scale: int, judging: bool
+):
+    bundle = street.bundle()
+    monkeypatch.setattr(PosePrior, "rescaled", lambda *_: bundle.prior_scale.clone())
+    assert any(bundle.refresh().scales for _ in range(10))
+    # Of corners, of lane points, and of what lane points of a detection have wrong together.
+    bundle.scale[scale] *= 1.5
+    assert bundle.refresh() == AtRest(scales=False, judging=judging)
+    assert bundle.refresh() == AtRest(scales=True, judging=True)
