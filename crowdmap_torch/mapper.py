@@ -34,7 +34,7 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     completed_signs,
 )
 from crowdmap_torch.crowd_signs.duplicates import may_be_one
-from crowdmap_torch.crowd_signs.gather import gather_signs
+from crowdmap_torch.crowd_signs.gather import gather_signs, signs_of_crowd
 from crowdmap_torch.crowd_signs.journey_bias import without_bias
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
 from crowdmap_torch.fleet.choice import engine_of
@@ -61,7 +61,6 @@ from crowdmap_torch.tables import (
     Signs,
     SurveySigns,
     Tracklets,
-    concatenate,
     concatenate_lanes,
 )
 from crowdmap_torch.tracking.lanes import associate_lanes
@@ -242,8 +241,9 @@ def first_map(
 ) -> FirstMap:
     """Section V-A: landmarks of many journeys in clusters, the journeys' biases, and the cluster heads."""
     config = config.resolved()
-    tracklets = [m.sign_tracklets for m in maps]
-    signs, sigma = concatenate([m.signs for m in maps]), config.positioning.bias_sigma_m
+    tracklets, sure = [m.sign_tracklets for m in maps], [m.signs for m in maps]
+    doubtful, sigma = [m.sign_report.doubtful for m in maps], config.positioning.bias_sigma_m
+    signs = signs_of_crowd(sure, doubtful, config.crowd.min_journeys)
     gathered = gather_signs(journeys, tracklets, signs, bias_sigma_m=sigma)
     generator = torch.Generator().manual_seed(config.seed)
     made, known = [m.lanes for m in maps], (config.positioning, config.crowd)

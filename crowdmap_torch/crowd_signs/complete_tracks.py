@@ -94,7 +94,9 @@ def associate_detections(
     heads = replace(heads, confidence=sure.to(heads.size))
     found = AssociatedSigns(heads, tentative[alone], associations, completed)
     given = journeys, poses, tracklets
-    return with_vouched(*given, found, passing[alone], config, completion, trusted=trusted)
+    found = with_vouched(*given, found, passing[alone], config, completion, trusted=trusted)
+    # In which not even the journey that saw them has any confidence.
+    return replace(found, tentative=found.tentative[found.tentative.confidence > 0])
 
 
 def with_vouched(

@@ -13,7 +13,7 @@ from crowdmap_torch.clustering.groups import distinct_pairs, pairs_within
 from crowdmap_torch.geometry.trajectory import station as along_track
 from crowdmap_torch.noise.stated_sigmas import stated_sigmas
 from crowdmap_torch.optim.robust import median_along
-from crowdmap_torch.tables import Journey, Signs, Tracklets
+from crowdmap_torch.tables import Journey, Signs, Tracklets, concatenate
 
 _FASTEST_MPS = 70.0
 """No car is faster [m/s]: a longer step between two frames is a fault of the positions."""
@@ -55,6 +55,11 @@ class CrowdSigns:
         return len(self.bias_sigma)
 
     @property
+    def doubtful(self) -> Bool[Tensor, " n"]:
+        """True for signs in which their own journeys have no confidence."""
+        return self.signs.confidence == 0
+
+    @property
     def viewing_axes(self) -> Float[Tensor, "n 3 3"]:
         """Columns: horizontally along the camera's axis where each sign was closest, across it, and up."""
         level = self.view_direction * self.view_direction.new_tensor([1.0, 1.0, 0.0])
@@ -62,6 +67,21 @@ class CrowdSigns:
         up = torch.zeros_like(along)
         up[:, 2] = 1
         return torch.stack((along, torch.linalg.cross(up, along), up), dim=2)
+
+
+def signs_of_crowd(signs: Sequence[Signs], doubtful: Sequence[Signs], min_journeys: int) -> Signs:
+    """The signs of all journeys, and behind them the `doubtful` ones, by journey.
+
+    Two journeys that show such a sign at one place vouch for each other. Where signs of one journey are to be in the map
+    nobody vouches for them, and they are left out.
+    """
+    if min(min_journeys, len(signs)) < 2:
+        return concatenate(list(signs))
+    numbered = (
+        replace(made, journey=torch.full_like(made.journey, number))
+        for number, made in enumerate(doubtful)
+    )
+    return concatenate([*signs, *numbered])
 
 
 def gather_signs(

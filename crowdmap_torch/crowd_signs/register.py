@@ -229,7 +229,7 @@ def _register_paper(
         bias_sigma=crowd.bias_sigma,
     )
     heads = sign_heads(signs, label, method="paper2017")
-    company = has_company(crowd, config.existence)
+    company = has_company(crowd, config.existence) & ~crowd.doubtful
     unbiased, drift = unbiased_signs(crowd, bias), largest_drift(bias)
     statistics = journey_statistics(
         unbiased, label, heads, company, bias.translation, drift, crowd.leap
@@ -261,7 +261,7 @@ def _register_joint(
     spectra: tuple[Spectrum, ...] = ()
     outliers: tuple[OutlierJourney, ...] = ()
     statistics = None
-    company = has_company(crowd, config.existence)
+    company = has_company(crowd, config.existence) & ~crowd.doubtful
     least = signs.size.new_tensor(config.least_sigma_m)
     extra = unexplained_covariance(crowd, least)
     for shift_sigma in config.shift_sigmas_m:

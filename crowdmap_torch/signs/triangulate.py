@@ -116,6 +116,8 @@ class SignReport:
     """As given, but rejoined tracklets share the label of one of them, and the shifts are those to the signs' corners."""
     error_sq: Float[Tensor, " d"]
     """Mean square whitened error of every detection that was used; NaN for the others."""
+    doubtful: Signs
+    """Those pruned for few views and no better place, with no confidence: they count where other journeys show them too."""
 
     @property
     def pruned(self) -> dict[str, int]:
@@ -142,26 +144,26 @@ def triangulate_signs(
     reason = torch.where(frames < config.min_frames, FEW_FRAMES, KEPT)
     rows = rows[reason[tracklets.label[rows]] == KEPT]
     if not len(rows):
-        return _no_signs(journey), SignReport(reason, tracklets, _per_detection(journey))
+        none = _no_signs(journey)
+        return none, SignReport(reason, tracklets, _per_detection(journey), none)
     label, sign = tracklets.label[rows].unique(return_inverse=True)
     seen = _Seen(tracklets, label, rows, views_of(journey, tracklets, rows, sign))
     drive = drive_path(journey, positioning, config.fit.nonholonomic, config.fit.drift)
     is_alone = config.method == "paper2017"
     fit_method = _fit_alone if is_alone else _fit_jointly
     fitted = fit_method(journey, seen, shape, drive, positioning, config)
-    seen, fit = fitted.seen, fitted.fit
-    label, views = seen.label, seen.views
+    seen, fit, label, views = fitted.seen, fitted.fit, fitted.seen.label, fitted.seen.views
     reason[fitted.rejoined] = REJOINED
     if is_alone:
-        fate = _fates_alone(views, fit, config)
+        fate, doubtful = _fates_alone(views, fit, config), torch.zeros_like(label, dtype=torch.bool)
     else:
-        fate = _fates(views, fit, fitted.noise_scale, config)
+        fate, doubtful = _fates(views, fit, fitted.noise_scale, config)
     reason[label] = fate
-    kept = fate == KEPT
     signs, turn = _signs(journey, seen.rows, views, fit, shape[label], label, config)
     error_sq = _per_detection(journey).index_put((seen.rows,), fit.error_sq)
     tracklets = _turned(journey, seen.tracklets, shape, label, turn)
-    return signs[kept], SignReport(reason, tracklets, error_sq)
+    no_signs = replace(signs[doubtful], confidence=torch.zeros_like(signs.confidence[doubtful]))
+    return signs[fate == KEPT], SignReport(reason, tracklets, error_sq, no_signs)
 
 
 @dataclass(frozen=True)
@@ -296,8 +298,8 @@ def _fit(
 
 def _fates(
     views: SignViews, fit: SignFit, scale: Float[Tensor, " n"], config: SignTriangulationConfig
-) -> Int[Tensor, " n"]:
-    """Whether each sign is kept, or why it is pruned; the first reason counts."""
+) -> tuple[Int[Tensor, " n"], Bool[Tensor, " n"]]:
+    """Whether each sign is kept, or why it is pruned, the first reason; and which are for having few views alone."""
     n = len(scale)
     away = distance_away(views, fit)
     agrees = (fit.error_sq < config.fit.tukey**2).to(scale)
@@ -317,9 +319,9 @@ def _fates(
         (UNCERTAIN, ~(sigma < config.max_sigma_m)),
     )
     fate = _first_reason(tests)
-    is_doubtful = agreeing < _least_views(agreeing[fate == KEPT], config.doubtful_frames)
-    fate[(fate == KEPT) & is_doubtful & ~(sigma < config.max_doubtful_sigma_m)] = UNCERTAIN
-    return fate
+    few = agreeing < _least_views(agreeing[fate == KEPT], config.doubtful_frames)
+    doubtful = (fate == KEPT) & few & ~(sigma < config.max_doubtful_sigma_m)
+    return fate.masked_fill(doubtful, UNCERTAIN), doubtful
 
 
 def _least_views(number: Float[Tensor, " n"], most: int) -> float:

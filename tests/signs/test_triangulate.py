@@ -289,9 +289,12 @@ def test_signs_that_are_seen_a_few_times_each_are_mapped():
     # Beside signs that are seen thirty times the same four views are a short run.
     run = (fast.sign != 3) | (fast.journey.signs.frame % 8 == 0)
     short = with_rows(fast, run.nonzero()[:, 0])
-    _, report = triangulate_signs(short.journey, by_truth(short), NOISE, CONFIG)
+    signs, report = triangulate_signs(short.journey, by_truth(short), NOISE, CONFIG)
     assert REASONS[int(report.reason[3])] == "position too uncertain"
-    assert report.pruned["kept"] == len(places) - 1
+    assert report.pruned["kept"] == len(signs) == len(places) - 1
+    # It is no sign of this drive's, but may be one of other drives'.
+    assert report.doubtful.tracklet.tolist() == [3] and report.doubtful.confidence.tolist() == [0]
+    assert bool((signs.confidence > 0).all())
 
 
 def test_a_standing_car_maps_nothing_new():
