@@ -51,7 +51,8 @@ _WHY: dict[str, tuple[str, str]] = {
     ),
     _TRACK + "residual too large": (
         "rays to one sign do not meet",
-        "check poses, lens, pixels and frame numbers",
+        "check poses, lens, pixels and frame numbers, or say how noisy corners are in "
+        "`sign_triangulation: {fit: {pixels: {sigma_px: 2.0}}}` of the configuration",
     ),
     _TRACK + "implausible size": (
         "what is mapped would be far too small or too large",

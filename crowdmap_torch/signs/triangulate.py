@@ -83,7 +83,7 @@ class SignTriangulationConfig(Settings):
     """Tracklets with fewer views in agreement must be better placed than others, unless a drive's signs are seen hardly any
     longer: false detections come in short runs."""
     max_doubtful_sigma_m: Sigma = 0.5
-    """Largest standard deviation of those."""
+    """Largest standard deviation of those; others are none of this journey's, and of the map where two journeys show one."""
     size_m: Span = (0.1, 16.5)
     """Of both methods: smallest and largest plausible width and height. A board above four lanes of 3.75 m is 15 m wide, and
     what is found of it may be a tenth more."""
