@@ -56,7 +56,7 @@ class CrowdSigns:
 
     @property
     def doubtful(self) -> Bool[Tensor, " n"]:
-        """True for signs in which their own journeys have no confidence."""
+        """True for signs in which their own journeys have no confidence; in others they have some, whatever their scores."""
         return self.signs.confidence == 0
 
     @property

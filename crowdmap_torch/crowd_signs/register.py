@@ -229,7 +229,7 @@ def _register_paper(
         bias_sigma=crowd.bias_sigma,
     )
     heads = sign_heads(signs, label, method="paper2017")
-    company = has_company(crowd, config.existence) & ~crowd.doubtful
+    company = has_company(crowd, config.existence)
     unbiased, drift = unbiased_signs(crowd, bias), largest_drift(bias)
     statistics = journey_statistics(
         unbiased, label, heads, company, bias.translation, drift, crowd.leap

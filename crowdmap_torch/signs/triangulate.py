@@ -404,7 +404,7 @@ def _signs(
         n_observations=group_sum(agrees.long(), views.sign, n),
         first_seen_ns=first.scatter_reduce(0, views.sign, t_ns, "amin"),
         last_seen_ns=last.scatter_reduce(0, views.sign, t_ns, "amax"),
-        confidence=1 - torch.exp(-evidence / config.confident_frames),
+        confidence=(1 - torch.exp(-evidence / config.confident_frames)).clamp_min(1e-9),
     )
     return signs, turn
 
