@@ -20,6 +20,8 @@ _FASTEST_MPS = 70.0
 _HARDEST_MPS2 = 12.0
 """Acceleration [m/s^2] that no car exceeds."""
 
+_SOME_CONFIDENCE = 1e-9
+"""Least confidence of a sign that is not doubtful: detectors may give all scores as zero."""
 _ONE_PLACE = 0.5
 """Detections nearer to each other in the image than this share of the smaller one show one sign."""
 
@@ -56,7 +58,7 @@ class CrowdSigns:
 
     @property
     def doubtful(self) -> Bool[Tensor, " n"]:
-        """True for signs in which their own journeys have no confidence; in others they have some, whatever their scores."""
+        """True for signs that their own journeys alone take for none (`signs_of_crowd`)."""
         return self.signs.confidence == 0
 
     @property
@@ -73,15 +75,21 @@ def signs_of_crowd(signs: Sequence[Signs], doubtful: Sequence[Signs], min_journe
     """The signs of all journeys, and behind them the `doubtful` ones, by journey.
 
     Two journeys that show such a sign at one place vouch for each other. Where signs of one journey are to be in the map
-    nobody vouches for them, and they are left out.
+    nobody vouches for them, and they are left out. They have no confidence; all others have some, whatever their scores.
     """
+    sure = concatenate(list(signs))
     if min(min_journeys, len(signs)) < 2:
-        return concatenate(list(signs))
+        return sure
+    sure = replace(sure, confidence=sure.confidence.clamp_min(_SOME_CONFIDENCE))
     numbered = (
-        replace(made, journey=torch.full_like(made.journey, number))
+        replace(
+            made,
+            journey=torch.full_like(made.journey, number),
+            confidence=torch.zeros_like(made.confidence),
+        )
         for number, made in enumerate(doubtful)
     )
-    return concatenate([*signs, *numbered])
+    return concatenate([sure, *numbered])
 
 
 def gather_signs(

