@@ -210,9 +210,9 @@ class Bundle(BundleState):
         if corners is not None and len(off) and self.config.method != "paper2017":
             values, detections = self.values(), self.detections
             runs = detections.run, len(off)
-            _, gradient, tells = first_blocks(corners, self.variables, values, *runs)
             of_pose = equations.conditional_covariance("pose")
             by_prior = left_by_prior(equations, of_pose)
+            _, gradient, tells = first_blocks(corners, self.variables, values, *runs)
             whose = self.corners.journey, len(told)
             off = held_off(corners, detections, values, tells, by_prior, *whose)
             seen = corners, detections, self.variables, values

@@ -21,8 +21,10 @@ from torch import Tensor
 from crowdmap_torch.optim.linearize import CHUNK_ROWS
 from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
+from crowdmap_torch.optim.solvers.normal_equations import BorderInformation
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
+from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
@@ -214,3 +216,14 @@ def weighted_sums(
         torch.cat([none, *of_sum]),
         torch.cat([weight.new_zeros(0, m), *value]),
     )
+
+
+def border_information(
+    structure: ChainStructure, reduced: TiledCholesky, added: Float[Tensor, " r"]
+) -> BorderInformation:
+    """That on the border of a reduced system, by its factors, to whose diagonal so much was `added`."""
+    where, begin = structure.where, structure.border_begin
+    upper = reduced.trailing(begin)
+    matrix = upper.mT @ upper - torch.diag(added[begin:])
+    entries = {name: where.entries(name, slice(None)) - begin for name in structure.plan.border}
+    return BorderInformation(matrix, entries)

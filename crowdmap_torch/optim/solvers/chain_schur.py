@@ -40,7 +40,7 @@ from crowdmap_torch.optim.solvers.block_elimination import (
     fill_chain,
     lead_of,
 )
-from crowdmap_torch.optim.solvers.border import ChainBorder, weighted_sums
+from crowdmap_torch.optim.solvers.border import ChainBorder, border_information, weighted_sums
 from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
 from crowdmap_torch.optim.solvers.known_landmarks import KnownLandmarks
@@ -220,8 +220,10 @@ class ChainNormalEquations:
 
     def conditional_covariance(self, name: str, *, told: float = 1.0) -> Float[Tensor, "n k k"]:
         """Covariance of every block of an eliminated variable, the landmarks known."""
-        known = self.known if told == 1.0 else self._known_if(told)
-        found = known.of_blocks()
+        if told != 1.0:
+            # What is known as it is goes first: both at once are the most memory of a step.
+            self.__dict__.pop("known", None)
+        found = self._of_blocks if told == 1.0 else self._known_if(told).of_blocks()
         return self.structure.unstack(found)[name][..., : self.structure.width[name]]
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:
@@ -246,6 +248,11 @@ class ChainNormalEquations:
         leads = factor.leads if factor is not None and is_own and factor.is_undamped else None
         blocks = self.structure, self.diagonal, self.link, self.coupling, self.hessian
         return KnownLandmarks.of(*blocks, leads)
+
+    @cached_property
+    def _of_blocks(self) -> Float[Tensor, "e k k"]:
+        """Covariance of every eliminated block, the landmarks known."""
+        return self.known.of_blocks()
 
     def _known_if(self, told: float) -> KnownLandmarks:
         """The same if what leaves see told so many times as much; their prior is what binds them to their carriers."""
@@ -417,17 +424,6 @@ def _rows_times(rows: Float[Tensor, "f w"], block: Float[Tensor, "f w k"]) -> Fl
     for i in range(1, rows.shape[1]):
         total.addcmul_(block[:, i], rows[:, i : i + 1])
     return total
-
-
-def border_information(
-    structure: ChainStructure, reduced: TiledCholesky, added: Float[Tensor, " r"]
-) -> BorderInformation:
-    """That on the border of a reduced system, by its factors, to whose diagonal so much was `added`."""
-    where, begin = structure.where, structure.border_begin
-    upper = reduced.trailing(begin)
-    matrix = upper.mT @ upper - torch.diag(added[begin:])
-    entries = {name: where.entries(name, slice(None)) - begin for name in structure.plan.border}
-    return BorderInformation(matrix, entries)
 
 
 def _equations(costs: Costs, sums: ReducibleSums, workspace: Workspace) -> ChainNormalEquations:

@@ -22,12 +22,16 @@ from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, of_everybody
-from crowdmap_torch.optim.solvers.border import ChainBorder, WeightedSums, weighted_sums
+from crowdmap_torch.optim.solvers.border import (
+    ChainBorder,
+    WeightedSums,
+    border_information,
+    weighted_sums,
+)
 from crowdmap_torch.optim.solvers.chain_schur import (
     UNOBSERVED_FLOOR,
     ChainBackend,
     ChainNormalEquations,
-    border_information,
 )
 from crowdmap_torch.optim.solvers.landmark_covariance import LandmarkCovariance
 from crowdmap_torch.optim.solvers.normal_equations import (
