@@ -16,6 +16,7 @@ from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim.robust import usual
 from crowdmap_torch.ranges import Angle, Count, Settings
 from crowdmap_torch.residuals.sign_prior import against_the_drive
+from crowdmap_torch.signs.corner_noise import corner_noise
 from crowdmap_torch.signs.fit import SignFitConfig, fit_signs_coarsely, robust_noise_scale
 from crowdmap_torch.signs.views import SignStart, SignViews, thinned
 from crowdmap_torch.tables import concatenate
@@ -30,6 +31,8 @@ MAX_SIZE_RATIO = 3.0
 """A plane whose size differs by more from the boxes' size is taken for a misfit."""
 _AS_ASSUMED = 48.0
 """Views with the noise that is assumed that count beside those of a drive: three tracklets' worth."""
+_MOST_IN_COMMON = 4.0
+"""Fits are never noisier than corners by themselves by more than this, by what all corners of a detection have wrong."""
 _MUCH_NOISIER = 1.3
 """A drive that is noisier by less has the noise that is assumed; each sign has a scale of its own beside."""
 _ROUNDS = 3
@@ -136,11 +139,15 @@ def choose_starts_of_drive(
 
     Cameras of many pixels, and detectors that look at pictures made smaller, have a noise of their own: by a bound on what
     is usual all of their signs would be pruned. The noise scales are multiples of the drive's, up to what `fit` admits.
+    Where most tracks are no signs, but plates of cars say, what is usual is their misfit: then corners' own noise counts.
     """
     seen = torch.bincount(views.sign, minlength=len(shape)).clamp_max(config.max_views)
     start, scale = choose_starts(views, shape, positioning, config, fit, size_limits=size_limits)
     for _ in range(_ROUNDS - 1):
-        noisier = usual(scale, seen.to(scale), assumed=1.0, beside=_AS_ASSUMED)
+        own = corner_noise(views, shape, fit.pixels)
+        noisier = usual(scale, seen.to(scale), assumed=own, beside=_AS_ASSUMED)
+        if noisier > _MOST_IN_COMMON * own:
+            noisier = own
         if noisier < _MUCH_NOISIER:
             break
         pixels = replace(fit.pixels, sigma_px=noisier * fit.pixels.sigma_px)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
-from worlds.sign_drive import F64, SignDrive, drive_past, signs_at, straight_poses
+from worlds.sign_drive import F64, SignDrive, drive_past, seen, signs_at, straight_poses
 
-from crowdmap_torch.geometry import camera, polygon, se3
+from crowdmap_torch.geometry import camera, polygon
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.signs.fit import SignFitConfig
 from crowdmap_torch.signs.initialize import (
@@ -20,23 +21,11 @@ from crowdmap_torch.signs.initialize import (
     choose_starts_of_drive,
     starts,
 )
-from crowdmap_torch.signs.triangulate import views_of
 from crowdmap_torch.signs.views import SignViews
-from crowdmap_torch.tables import Tracklets
+from crowdmap_torch.tables import concatenate
 
 NOISE, START, FIT = PositioningNoise(), SignStartConfig(), SignFitConfig()
 LIMITS = (0.1, 8.0)
-
-
-def seen(drive: SignDrive) -> SignViews:
-    """The views of a drive, corners in the order of the signs' templates."""
-    signs = drive.journey.signs
-    T = se3.inverse(drive.journey.T_world_camera[signs.frame])
-    exact = se3.transform(T[:, None], drive.corners_world[drive.sign])
-    px, _ = camera.project(drive.journey.rig.camera, exact)
-    shift, _ = polygon.best_shift(px, signs.corners_px, polygon.corner_count(signs.shape))
-    tracklets = Tracklets(drive.sign, len(drive.T_world_sign), shift)
-    return views_of(drive.journey, tracklets, torch.arange(len(signs)), drive.sign)
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +83,49 @@ def test_corners_are_as_noisy_as_the_drive_shows(noise_px: float, least: float, 
     )
     assert least <= fit.pixels.sigma_px / FIT.pixels.sigma_px <= most
     assert scale.median() < 1.3
+
+
+def _with_plates(drive: SignDrive, plates: int) -> tuple[SignViews, torch.Tensor]:
+    """What was seen, and beside it plates of cars ahead that stay where they are in the image but for some sway."""
+    views, generator = seen(drive), torch.Generator().manual_seed(3)
+    n, first = len(drive.shape), views[views.sign == 0]
+    first = first[torch.argsort(first.frame)]
+    still = first.corners_px[:1] - first.corners_px[:1, :1] + 600.0
+    every = [views]
+    for i in range(plates):
+        sway = torch.randn(len(first), 1, 2, dtype=F64, generator=generator).mul(10.0).cumsum(0)
+        px = still + sway + 0.5 * torch.randn(len(first), 8, 2, dtype=F64, generator=generator)
+        rig_camera = drive.journey.rig.camera
+        corner = polygon.pad(px, polygon.corner_count(drive.shape[:1]).expand(len(px)))
+        ideal, _ = camera.unproject(rig_camera, corner)
+        matrix = camera.observation_matrix(rig_camera, corner, ideal)
+        every.append(
+            replace(
+                first,
+                sign=torch.full_like(first.sign, n + i),
+                corners_px=corner,
+                corners_ideal=ideal,
+                observation=matrix,
+            )
+        )
+    return concatenate(every), drive.shape[:1].expand(n + plates)
+
+
+def test_plates_of_cars_do_not_make_a_drive_noisy():
+    centers = [(3.5 * (-1) ** i, 60.0 + 5.0 * i, 2.5) for i in range(4)]
+    drive = drive_past(straight_poses(120), signs_at(centers), noise_px=0.5)
+    views, shape = _with_plates(drive, 24)
+    *_, scale, fit = choose_starts_of_drive(views, shape, NOISE, START, FIT, size_limits=LIMITS)
+    assert scale[4:].median() > 3.0, "most tracks misfit"
+    assert fit.pixels.sigma_px == FIT.pixels.sigma_px
+    assert scale[:4].max() < 1.3
+
+
+def test_two_signs_show_that_their_corners_are_noisy():
+    centers = [(3.5, 60.0, 2.5), (-4.0, 75.0, 3.0)]
+    drive = drive_past(straight_poses(120), signs_at(centers), noise_px=4.0)
+    *_, scale, fit = choose_starts_of_drive(
+        seen(drive), drive.shape, NOISE, START, FIT, size_limits=LIMITS
+    )
+    assert 4.5 <= fit.pixels.sigma_px / FIT.pixels.sigma_px <= 9.0
+    assert scale.max() < 1.3

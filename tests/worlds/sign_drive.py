@@ -12,6 +12,8 @@ from worlds.small_world import Builder
 from crowdmap_torch.geometry import camera as cameras
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.camera import Camera
+from crowdmap_torch.signs.triangulate import views_of
+from crowdmap_torch.signs.views import SignViews
 from crowdmap_torch.tables import Association, Journey, Rig, SignDetections, Signs, Tracklets
 
 F64 = torch.float64
@@ -102,6 +104,17 @@ def drive_past(
     )
     journey = make_journey(RIG, poses, signs=detections)
     return SignDrive(journey, sign, T_world_sign, sizes, codes)
+
+
+def seen(drive: SignDrive) -> SignViews:
+    """The views of a drive, corners in the order of the signs' templates."""
+    signs = drive.journey.signs
+    T = se3.inverse(drive.journey.T_world_camera[signs.frame])
+    exact = se3.transform(T[:, None], drive.corners_world[drive.sign])
+    px, _ = cameras.project(drive.journey.rig.camera, exact)
+    shift, _ = polygon.best_shift(px, signs.corners_px, polygon.corner_count(signs.shape))
+    tracklets = Tracklets(drive.sign, len(drive.T_world_sign), shift)
+    return views_of(drive.journey, tracklets, torch.arange(len(signs)), drive.sign)
 
 
 def with_rows(drive: SignDrive, rows: Tensor) -> SignDrive:

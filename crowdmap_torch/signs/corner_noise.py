@@ -1,0 +1,55 @@
+"""How noisy the corners of a drive are, told by themselves (IV-B): by how outlines change from view to view.
+
+Where a sign is seen from moves its outline and makes it larger, little by little; what else changes between two views of one
+track in a row is noise of its corners, on a post or on a bus. So this needs no fit, and nothing that misfits spoils it, but
+it does not see what all corners of a detection have wrong together.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from crowdmap_torch.geometry import polygon
+from crowdmap_torch.noise.pixels import PixelNoiseConfig
+from crowdmap_torch.optim.robust import usual
+from crowdmap_torch.signs.views import SignViews
+
+_AS_ASSUMED = 8.0
+"""Pairs of views with the noise that is assumed that count beside those of a drive."""
+_OF_MOVES = 3
+"""Numbers of an outline that moves and scale take: they tell of no noise."""
+_BOX_VARIANCE = 2.0
+"""Variance of the one shape that boxes have, that of their sides, in units of a side's."""
+
+
+def corner_noise(views: SignViews, shape: Int[Tensor, " n"], config: PixelNoiseConfig) -> float:
+    """Noise of the drive's corners as a multiple of what is assumed, at least 1: the median of pairs of views in a row."""
+    order = torch.argsort(views.frame, stable=True)
+    order = order[torch.argsort(views.sign[order], stable=True)]
+    first, second = order[:-1], order[1:]
+    is_pair = views.sign[first] == views.sign[second]
+    first, second = first[is_pair], second[is_pair]
+    own = shape[views.sign[first]]
+    outline = views.corners_px[torch.stack((first, second))]
+    corner = polygon.corner_mask(own)[..., None].to(outline)
+    number = corner.sum(-2, keepdim=True)
+    outline = (outline - (outline * corner).sum(-2, keepdim=True) / number) * corner
+    extent = outline.square().sum((-2, -1), keepdim=True).sqrt().clamp_min(1e-9)
+    # Both as large as the geometric mean of the two.
+    change = (outline[0] / extent[0] - outline[1] / extent[1]) * (extent[0] * extent[1]).sqrt()
+    is_box = polygon.is_box(views.corners_px[first]) & polygon.is_box(views.corners_px[second])
+    freedom = torch.where(is_box, 1.0, 2 * number[:, 0, 0] - _OF_MOVES)
+    variance = torch.where(is_box, _BOX_VARIANCE, freedom)
+    # The median of a chi-squared (Wilson and Hilferty 1931), of two views.
+    expected = 2 * variance * (1 - 2 / (9 * freedom)) ** 3
+    box = _box(views.corners_px[first]) * _box(views.corners_px[second])
+    assumed = config.sigma_px**2 * (1 + config.small_box_px**2 / box)
+    ratio = change.square().sum((-2, -1)) / (expected * assumed)
+    return max(usual(ratio, torch.ones_like(ratio), assumed=1.0, beside=_AS_ASSUMED) ** 0.5, 1.0)
+
+
+def _box(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, " m"]:
+    """The longer side of the box of each outline [px]."""
+    return (corners_px.amax(1) - corners_px.amin(1)).amax(-1).clamp_min(1.0)
