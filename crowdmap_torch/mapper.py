@@ -32,6 +32,7 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     associate_detections,
     associated_once,
     completed_signs,
+    without_strayed,
 )
 from crowdmap_torch.crowd_signs.duplicates import may_be_one
 from crowdmap_torch.crowd_signs.gather import gather_signs, signs_of_crowd
@@ -114,7 +115,7 @@ class FirstMap:
     anew: int = 0
     """How often it was made anew of an adjusted map."""
     joined: int = 0
-    """Signs that went into others then."""
+    """Signs that went into others then, or astray."""
     before: FirstMap | None = None
     """That of the clusters, before any adjustment, where it was made anew."""
     footing: Footing | None = None
@@ -156,10 +157,9 @@ def build_map(
     control: SurveySigns | None = None,
 ) -> MapResult:
     """The map of all journeys, pinned by signs in `control`; `progress` is told the stage, what is done and of how much."""
-    journeys = dataset.journeys
     with engine_of(None, workers=workers) as engine:
-        maps = map_journeys(journeys, config, engine=engine, progress=progress)
-    first = first_map(journeys, maps, config)
+        maps = map_journeys(dataset.journeys, config, engine=engine, progress=progress)
+    first = first_map(dataset.journeys, maps, config)
     how = {"control": control, "progress": progress}
     with engine_of(None, workers=workers) as engine:
         return adjusted_map(dataset, maps, first, config, engine=engine, **how)
@@ -354,7 +354,7 @@ def made_anew(
     config: MapperConfig,
     engine: Engine | None = None,
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
-    """What the adjustment begins again with: where it was, and without what turned out to be one; None: nothing did.
+    """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: none did.
 
     Markers that are there twice are joined anew. With it the covariances, if they had to be known for that.
     """
@@ -365,15 +365,15 @@ def made_anew(
     poses, crowd = adjust.read_poses(bundle, journeys), first.crowd
     drifts = tuple(map(se3.local, (j.T_world_camera for j in journeys), poses))
     markers = lanes, [m.lanes for m in maps], drifts, crowd.trusted_frames(journeys)
-    joined, once, known = joined_anew(*markers, crowd.positioning, config.lane_join), None, None
-    if len(may_be_one(signs, journeys, first.associations, rules)):
-        known = map_uncertainty(bundle, first.signs, first.lanes, engine)
-        signs = replace(signs, covariance=known.of_their_own)
+    joined, known = joined_anew(*markers, crowd.positioning, config.lane_join), None
     found = AssociatedSigns(signs, first.tentative, first.associations, first.completed)
-    if known is not None:
-        given = journeys, poses, [m.sign_tracklets for m in maps], found
+    once = without_strayed(found, first.signs, journeys, first.drifts, drifts, rules)
+    if once is None and len(may_be_one(signs, journeys, first.associations, rules)):
+        known = map_uncertainty(bundle, first.signs, first.lanes, engine)
+        found = replace(found, heads=replace(signs, covariance=known.of_their_own))
+        given = journeys, poses, [m.sign_tracklets for m in maps], found, rules
         sound = crowd.journey_weight > 0
-        once = associated_once(*given, rules, config.complete_tracks, trusted=sound)
+        once = associated_once(*given, config.complete_tracks, trusted=sound)
     if joined is None and once is None:
         return None, known
     found = once or found

@@ -17,7 +17,12 @@ from torch import Tensor
 from crowdmap_torch.clustering.assignment import match_slots
 from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_count
 from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
-from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, duplicate_signs, same_sign
+from crowdmap_torch.crowd_signs.duplicates import (
+    DuplicateSignConfig,
+    duplicate_signs,
+    gone_astray,
+    same_sign,
+)
 from crowdmap_torch.crowd_signs.existence import existence, still_alone
 from crowdmap_torch.crowd_signs.projections import (
     Candidates,
@@ -252,6 +257,23 @@ def associated_once(
     heads, completed = completed_signs(*given, *joined, completion, trusted=trusted)
     alone = still_alone(before.tentative, tracklets, completed.associations)
     return AssociatedSigns(heads, before.tentative[alone], completed.associations, completed)
+
+
+def without_strayed(
+    after: AssociatedSigns,
+    before: Signs,
+    journeys: Sequence[Journey],
+    begun: Sequence[Float[Tensor, "_ 6"]],
+    ended: Sequence[Float[Tensor, "_ 6"]],
+    config: DuplicateSignConfig,
+) -> AssociatedSigns | None:
+    """What is `after` an adjustment without the heads that have `gone_astray` in it; None if none did."""
+    strayed = gone_astray(before, after.heads, journeys, after.associations, begun, ended, config)
+    if not bool(strayed.any()) or after.completed is None:
+        return None
+    associations = without_signs(after.associations, strayed)
+    completed = replace(after.completed, associations=associations)
+    return AssociatedSigns(after.heads[~strayed], after.tentative, associations, completed)
 
 
 def join_duplicates(

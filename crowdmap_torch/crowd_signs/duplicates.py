@@ -1,4 +1,4 @@
-"""Unlike the paper: which signs are one, among cluster heads (V-A.1) and in an adjusted map (V-B).
+"""Unlike the paper: which signs are one, among cluster heads (V-A.1) and in an adjusted map (V-B), and which are none.
 
 Where rotations are off, one sign's triangulations by different drives lie metres apart, too far for one cluster. The
 adjustment, which sees all rays at once, brings them to one place.
@@ -17,6 +17,7 @@ from crowdmap_torch.clustering.groups import (
     distinct_pairs,
     group_argmin,
     group_count,
+    group_sum,
     pairs_within,
     rows_of_ranges,
 )
@@ -25,6 +26,7 @@ from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance, sign_distance
 from crowdmap_torch.crowd_signs.merge import mutual_partners
 from crowdmap_torch.crowd_signs.projections import candidates_of, misfit_px, projection_errors
+from crowdmap_torch.geometry import se3
 from crowdmap_torch.ranges import Cost, Count, Length, RoundsOrNone, Settings, Share, Sigma
 from crowdmap_torch.tables import Association, Journey, Signs
 
@@ -42,6 +44,9 @@ class DuplicateSignConfig(Settings):
     overlap: Share = 0.35
     """Closer than this share of the smaller side, they are one plate detected twice, whoever saw both; and if one drive did,
     whatever their codes: no sign was put in the place of another meanwhile."""
+    stray_m: Length = 5.0
+    """A sign that the adjustment takes further than this from where drives agreed that it is, beside the cameras that saw
+    it, is none of the map [m]."""
     least_sigma_m: Sigma = 0.02
     """1-sigma of places that covariances leave out [m]."""
     candidates: Count = 8
@@ -91,6 +96,35 @@ def duplicate_signs(
     duplicate = torch.zeros(n, dtype=torch.bool, device=weaker.device)
     duplicate[weaker[~is_first]] = True
     return duplicate
+
+
+def gone_astray(
+    before: Signs,
+    after: Signs,
+    journeys: Sequence[Journey],
+    associations: Sequence[Association],
+    begun: Sequence[Float[Tensor, "_ 6"]],
+    ended: Sequence[Float[Tensor, "_ 6"]],
+    config: DuplicateSignConfig,
+) -> Bool[Tensor, " n"]:
+    """True for signs that an adjustment took elsewhere, by their rows `before` and `after` it.
+
+    What drives took for one sign though its rays meet nowhere, such as plates of vehicles ahead, goes where it does no
+    harm: far off and up in the air. `begun` and `ended` are the tangents from the given poses to those before and after.
+    """
+    n, moved = len(before), after.center_world - before.center_world
+    least = torch.full_like(moved[:, 0], torch.inf)
+    for journey, association, old, new in zip(journeys, associations, begun, ended, strict=True):
+        rows = torch.nonzero(association.sign >= 0)[:, 0]
+        shown, frame = association.sign[rows], journey.signs.frame[rows]
+        given = journey.T_world_camera[frame]
+        move = se3.retract(given, new[frame]) - se3.retract(given, old[frame])
+        number = group_count(shown, n)
+        of_cameras = group_sum(move[:, :3, 3], shown, n) / number.clamp_min(1)[:, None]
+        beside = (moved - of_cameras).norm(dim=1)
+        least = torch.where(number > 0, torch.minimum(least, beside), least)
+    # Drives that lie far off may have moved by more: one with which it went is enough.
+    return least.isfinite() & (least > config.stray_m)
 
 
 def may_be_one(

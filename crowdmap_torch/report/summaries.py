@@ -97,7 +97,7 @@ def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict
         if first.completed
         else 0,
         "adjustments begun again": first.anew,
-        "signs joined after the adjustment": first.joined,
+        "signs joined or gone after the adjustment": first.joined,
         "sign detections used": sum(int((a.sign >= 0).sum()) for a in result.associations),
         "lane detections used": sum(int((a.lane >= 0).sum()) for a in result.associations),
         "control points": result.control_points,

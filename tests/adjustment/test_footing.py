@@ -15,7 +15,7 @@ from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.crowd_lanes.joined_anew import share_twice
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.mapper import FirstMap, MapResult, adjusted_map, build_bundle
+from crowdmap_torch.mapper import FirstMap, MapResult, adjusted_map, build_bundle, made_anew
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.tables import Dataset
 
@@ -144,3 +144,24 @@ def test_markers_that_were_taken_for_two_are_one_in_the_end(tiny, tiny_result: M
     # Each has what all drives saw of it, and the map of the clusters is that of before.
     assert torch.equal(lanes.n_journeys, tiny_result.hd_map.lanes.n_journeys)
     assert len(found.map_clusters.lanes) == len(twice)
+
+
+def test_a_sign_that_the_adjustment_took_elsewhere_is_none(
+    tiny, tiny_result: MapResult, ended: Bundle
+):
+    """Its head was 20 m from where the adjustment has it, as if no rays had met there."""
+    first = tiny_result.first
+    elsewhere = first.signs.T_world_sign.clone()
+    elsewhere[0, 1, 3] += 20.0
+    astray = replace(first, signs=replace(first.signs, T_world_sign=elsewhere))
+    given = tiny.journeys, tiny_result.journey_maps
+    config = MapperConfig()
+    again, _ = made_anew(*given, astray, ended, config)
+    assert again is not None and again.anew == 1 and again.joined == 1
+    assert len(again.signs) == len(first.signs) - 1
+    for before, after in zip(first.associations, again.associations, strict=True):
+        assert torch.equal(after.sign, (before.sign - 1).clamp_min(-1))
+    assert made_anew(*given, first, ended, config)[0] is None
+    found = adjusted_map(tiny, tiny_result.journey_maps, again, config)
+    gone = first.signs[:1].center_world
+    assert float(torch.cdist(gone, found.hd_map.signs.center_world).min()) > 0.3

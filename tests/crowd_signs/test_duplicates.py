@@ -19,7 +19,12 @@ from worlds.sign_drive import (
     two_journeys,
 )
 
-from crowdmap_torch.crowd_signs.complete_tracks import join_duplicates
+from crowdmap_torch.crowd_signs.complete_tracks import (
+    AssociatedSigns,
+    CompletedTracks,
+    join_duplicates,
+    without_strayed,
+)
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, may_be_one, seen_together
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.tables import Association, Journey, Signs
@@ -176,3 +181,38 @@ def test_a_map_without_signs_has_none_twice() -> None:
     none = map_of(drive)[torch.zeros(0, dtype=torch.int64)]
     association = associated(drive, torch.zeros(len(drive.sign), dtype=torch.bool))
     assert join_duplicates(none, [drive.journey], [association], CONFIG) is None
+
+
+@pytest.mark.parametrize(
+    ("of_sign_m", "of_cameras_m", "astray"),
+    [(8.0, 0.0, True), (8.0, 8.0, False), (0.0, 8.0, True), (3.0, 0.0, False)],
+)
+def test_signs_go_astray_beside_the_cameras_that_saw_them(
+    drive: SignDrive, of_sign_m: float, of_cameras_m: float, *, astray: bool
+) -> None:
+    known = torch.ones(len(drive.sign), dtype=torch.bool)
+    before, association = map_of(drive), associated(drive, known)
+    moved = before.T_world_sign.clone()
+    # All cameras rise, of the signs the second does not rise with them.
+    moved[:, 2, 3] += of_cameras_m
+    moved[1, 2, 3] += of_sign_m - of_cameras_m
+    after = AssociatedSigns(
+        replace(before, T_world_sign=moved),
+        before[:0],
+        (association,),
+        CompletedTracks((association,), 0, 0),
+    )
+    given = drive.journey.T_world_camera
+    begun, risen = torch.zeros(len(given), 6, dtype=F64), given.clone()
+    risen[:, 2, 3] += of_cameras_m
+    drifts = [begun], [se3.local(given, risen)]
+    found = without_strayed(after, before, [drive.journey], *drifts, CONFIG)
+    if not astray:
+        assert found is None
+        return
+    assert found is not None and len(found.heads) == len(PLACES) - 1
+    assert torch.equal(found.heads.T_world_sign, moved[[0, 2]])
+    number = torch.tensor([0, -1, 1])
+    assert torch.equal(found.associations[0].sign, number[association.sign])
+    assert found.completed is not None
+    assert torch.equal(found.completed.associations[0].sign, number[association.sign])
