@@ -168,9 +168,9 @@ def _nodes(
 
 
 def _nearest_poses(pose: Float[Tensor, "p 4 4"], point: Float[Tensor, "c 3"]) -> Int[Tensor, " c"]:
-    """The pose nearest to each point; none where there is no pose."""
+    """The pose nearest to each point; -1 where there is no pose at all."""
     if not len(pose):
-        return torch.zeros(0, dtype=torch.long, device=pose.device)
+        return torch.full_like(point[:, 0], -1, dtype=torch.long)
     _, nearest = KDTree(pose[:, :3, 3].cpu().numpy()).query(point.cpu().numpy())
     return torch.as_tensor(nearest, dtype=torch.long, device=pose.device)
 

@@ -265,3 +265,16 @@ def test_outlines_that_tremble_for_a_while_are_worth_less(street: Street, adjust
     a, b = (map_uncertainty(x, street.signs, street.lanes) for x in (still, bundle))
     own = [(x.center - x.shared).diagonal(dim1=1, dim2=2).sum(1) for x in (a, b)]
     assert float((own[1] / own[0]).median()) > 1.2
+
+
+def test_where_no_frame_shows_the_map_it_stays_as_it_is(street: Street):
+    far = street.lanes.control.point_world + torch.tensor([0.0, 0.0, 500.0], dtype=torch.float64)
+    lanes = replace(street.lanes, control=replace(street.lanes.control, point_world=far))
+    nothing = tuple(replace(a, sign=torch.full_like(a.sign, -1)) for a in street.associations)
+    alone = replace(street, signs=street.signs[:0], lanes=lanes, associations=nothing)
+    bundle = alone.bundle()
+    assert len(bundle.values()["pose"]) == 0 < len(bundle.values()["lane"])
+    assert adjust.adjust(bundle).done
+    signs, kept = adjust.read_map(bundle, alone.signs, lanes)
+    assert len(signs) == 0
+    assert torch.allclose(kept.control.point_world, far, atol=1e-6)
