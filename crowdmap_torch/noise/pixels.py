@@ -66,8 +66,7 @@ def detection_noise(
     config: PixelNoiseConfig,
 ) -> DetectionNoise:
     """The noise of detections whose pixels are noisier by `factor` than usual, and whose poses have such a variance."""
-    box = (corners_px.amax(1) - corners_px.amin(1)).amax(-1)
-    pixel = config.sigma_px**2 * (1 + (config.small_box_px / box).square()) * factor.square()
+    pixel = corner_variance(longer_side(corners_px), config) * factor.square()
     dim = by_pose.shape[1]
     whitening = by_pose.new_empty(len(by_pose), dim, dim)
     eye = torch.eye(dim, dtype=by_pose.dtype, device=by_pose.device)
@@ -82,6 +81,16 @@ def detection_noise(
         lower = torch.linalg.cholesky(covariance)
         whitening[here] = torch.linalg.solve_triangular(lower, eye.expand_as(lower), upper=False)
     return DetectionNoise(whitening, by_pose, pose_variance, pose_error)
+
+
+def longer_side(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, " m"]:
+    """The longer side of the box around each outline [px]."""
+    return (corners_px.amax(1) - corners_px.amin(1)).amax(-1)
+
+
+def corner_variance(box_px: Float[Tensor, " m"], config: PixelNoiseConfig) -> Float[Tensor, " m"]:
+    """The variance of a corner per axis that is usual where the longer side of its box is that long [px^2]."""
+    return config.sigma_px**2 * (1 + (config.small_box_px / box_px).square())
 
 
 def box_scales(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, "m 16 2"]:

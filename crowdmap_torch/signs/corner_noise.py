@@ -8,13 +8,13 @@ it does not see what all corners of a detection have wrong together.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import polygon
-from crowdmap_torch.noise.pixels import PixelNoiseConfig
+from crowdmap_torch.noise.pixels import PixelNoiseConfig, corner_variance, longer_side
 from crowdmap_torch.optim.robust import usual
-from crowdmap_torch.signs.views import SignViews
+from crowdmap_torch.signs.views import SignViews, sign_by_sign
 
 _AS_ASSUMED = 8.0
 """Pairs of views with the noise that is assumed that count beside those of a drive."""
@@ -26,8 +26,7 @@ _BOX_VARIANCE = 2.0
 
 def corner_noise(views: SignViews, shape: Int[Tensor, " n"], config: PixelNoiseConfig) -> float:
     """Noise of the drive's corners as a multiple of what is assumed, at least 1: the median of pairs of views in a row."""
-    order = torch.argsort(views.frame, stable=True)
-    order = order[torch.argsort(views.sign[order], stable=True)]
+    order = sign_by_sign(views)
     first, second = order[:-1], order[1:]
     is_pair = views.sign[first] == views.sign[second]
     first, second = first[is_pair], second[is_pair]
@@ -44,12 +43,7 @@ def corner_noise(views: SignViews, shape: Int[Tensor, " n"], config: PixelNoiseC
     variance = torch.where(is_box, _BOX_VARIANCE, freedom)
     # The median of a chi-squared (Wilson and Hilferty 1931), of two views.
     expected = 2 * variance * (1 - 2 / (9 * freedom)) ** 3
-    box = _box(views.corners_px[first]) * _box(views.corners_px[second])
-    assumed = config.sigma_px**2 * (1 + config.small_box_px**2 / box)
+    box = longer_side(views.corners_px)
+    assumed = corner_variance((box[first] * box[second]).sqrt().clamp_min(1.0), config)
     ratio = change.square().sum((-2, -1)) / (expected * assumed)
     return max(usual(ratio, torch.ones_like(ratio), assumed=1.0, beside=_AS_ASSUMED) ** 0.5, 1.0)
-
-
-def _box(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, " m"]:
-    """The longer side of the box of each outline [px]."""
-    return (corners_px.amax(1) - corners_px.amin(1)).amax(-1).clamp_min(1.0)

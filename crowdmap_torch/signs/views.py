@@ -100,10 +100,15 @@ def closest_approach(
     return frame.gather(1, distance.argmin(1, keepdim=True))[:, 0]
 
 
+def sign_by_sign(views: SignViews) -> Int[Tensor, " m"]:
+    """The order of the views of one sign after the other, each along its frames."""
+    order = torch.argsort(views.frame, stable=True)
+    return order[torch.argsort(views.sign[order], stable=True)]
+
+
 def thinned(views: SignViews, most: int) -> Bool[Tensor, " m"]:
     """About `most` views of each sign, spread evenly over its frames, the last one among them."""
-    order = torch.argsort(views.frame, stable=True)
-    order = order[torch.argsort(views.sign[order], stable=True)]
+    order = sign_by_sign(views)
     count = torch.bincount(views.sign)
     first = (count.cumsum(0) - count)[views.sign[order]]
     rank = torch.arange(len(order), device=order.device) - first
