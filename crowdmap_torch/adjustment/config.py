@@ -58,8 +58,8 @@ class AdjustConfig(Settings):
     """Least standard deviation of a sign corner of a large box; more where the residuals say so. Method `paper2017`: of
     any pixel."""
     box_sigma: SigmaOrNone = 0.5
-    """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, as a share of them; 0: boxes are
-    taken for outlines."""
+    """Noise of the sides of detections that are axis-aligned boxes, drawn around a sign, or have their shape drawn into one,
+    as a share of them; 0: boxes are taken for outlines."""
     habit: SignHabit = field(default_factory=SignHabit)
     """What signs are like before anything is seen of them."""
     size_classes_m: tuple[tuple[Length, Length], ...] = ()

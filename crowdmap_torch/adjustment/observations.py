@@ -67,8 +67,9 @@ def corner_observations(
 ) -> CornerObservations:
     """Corners of the detections that show a sign of the map, where the shapes agree.
 
-    Detections that are axis-aligned boxes were drawn around a sign, with sides wrong by the share `box_sigma`: their
-    centres are rows of their own, and their corners know no more than that. With 0 they are outlines like others.
+    Detections that are axis-aligned boxes, or have their shape drawn into one, were drawn around a sign, with sides wrong by
+    the share `box_sigma`: their centres are rows of their own, and their corners know no more than that. With 0 they are
+    outlines like others.
     """
     offsets, (_, lenses) = frame_offsets(journeys), lenses_of(journeys)
     begins = accumulate((len(journey.signs) for journey in journeys), initial=0)
@@ -108,7 +109,7 @@ def _corners(
     box = (px.amax(1) - px.amin(1)).amax(-1)
     mask, template = polygon.corner_mask(shape), polygon.template(shape)
     row, corner = torch.nonzero(mask, as_tuple=True)
-    boxed = polygon.is_box(px) & (box_sigma > 0)
+    boxed = polygon.is_box(px, shape) & (box_sigma > 0)
     centre = torch.nonzero(boxed)[:, 0]
 
     def mean(at_corners: Float[Tensor, "d 8 2"]) -> Float[Tensor, "c 2"]:

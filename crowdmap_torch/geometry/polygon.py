@@ -39,6 +39,8 @@ TRIANGLE, INVERTED_TRIANGLE, RECTANGLE, DIAMOND, PENTAGON, OCTAGON = range(6)
 MAX_CORNERS = 8
 CORNER_COUNT = torch.tensor([len(corners) for corners in _BOX_CORNERS.values()])
 """Corners of each shape."""
+_DRAWN_PX = 2e-3
+"""Corners that are that near to where a shape has them in a box were drawn there [px]."""
 _REGULAR_TOLERANCE = 0.02
 """If width and height differ by less, any of an octagon's eight sides can be the top."""
 
@@ -71,10 +73,33 @@ def corner_count(shape: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch"]:
     return CORNER_COUNT.to(shape.device)[shape]
 
 
-def is_box(corners_px: Float[Tensor, "m 8 2"]) -> Bool[Tensor, " m"]:
-    """Whether an outline is an axis-aligned box of the image, to the last digit."""
-    low, high = corners_px.amin(1, keepdim=True), corners_px.amax(1, keepdim=True)
-    return ((corners_px == low) | (corners_px == high)).all(-1).all(-1)
+def is_box(corners_px: Float[Tensor, "m 8 2"], shape: Int[Tensor, " m"]) -> Bool[Tensor, " m"]:
+    """Whether outlines are axis-aligned boxes of the image with the shape drawn into them.
+
+    What is upright or level in the shape is so to the last digit, and the rest as exactly as float32 has it. Slots past a
+    shape's number of corners repeat one of them.
+    """
+    low, high = corners_px.amin(1), corners_px.amax(1)
+    off = corners_px[:, :, None] - in_box(low, high, shape)[:, None]
+    is_near = (off.abs().amax(-1).amin(-1) <= _DRAWN_PX).all(-1)
+    return is_near & (_levels(corners_px) <= _levels(template(shape))).all(-1)
+
+
+def _levels(corners: Float[Tensor, "m 8 2"]) -> Int[Tensor, "m 2"]:
+    """How many different places corners have across and up."""
+    return 1 + corners.sort(dim=1).values.diff(dim=1).count_nonzero(dim=1)
+
+
+def in_box(
+    low: Float[Tensor, "*batch 2"], high: Float[Tensor, "*batch 2"], shape: Int[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 8 2"]:
+    """Corners of upright signs that face the camera and fill boxes of the image, v down."""
+    drawn = template(shape).to(low)
+    least, most = drawn.amin(-2, keepdim=True), drawn.amax(-2, keepdim=True)
+    share = (drawn - least) / (most - least)
+    # The template's y axis points up.
+    share = torch.stack((share[..., 0], 1 - share[..., 1]), dim=-1)
+    return low[..., None, :] + share * (high - low)[..., None, :]
 
 
 def corner_mask(shape: Int[Tensor, "*batch"]) -> Bool[Tensor, "*batch 8"]:

@@ -33,8 +33,8 @@ class PixelNoiseConfig(Settings):
     small_box_px: Pixels = 12.0
     """Box at which that noise has grown by a factor of 1.41 [px]."""
     box_sigma: Sigma = 0.5
-    """Noise of width and height of detections that are axis-aligned boxes, as a share: boxes are drawn around a sign, wider
-    than its outline where it is seen at an angle."""
+    """Noise of width and height of detections that are axis-aligned boxes, or have their shape drawn into one, as a share:
+    boxes are drawn around a sign, wider than its outline where it is seen at an angle."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ class DetectionNoise:
 
 def detection_noise(
     corners_px: Float[Tensor, "m 8 2"],
+    shape: Int[Tensor, " m"],
     factor: Float[Tensor, " m"],
     by_pose: Float[Tensor, "m 16 6"],
     pose_variance: Float[Tensor, "m 6"],
@@ -76,7 +77,7 @@ def detection_noise(
         here = slice(first, first + lot)
         covariance = (by_pose[here] * pose_variance[here, None]) @ by_pose[here].mT
         covariance.diagonal(dim1=-2, dim2=-1).add_(pixel[here, None])
-        by_scale = box_scales(corners_px[here]) * config.box_sigma
+        by_scale = box_scales(corners_px[here], shape[here]) * config.box_sigma
         covariance += by_scale @ by_scale.mT
         lower = torch.linalg.cholesky(covariance)
         whitening[here] = torch.linalg.solve_triangular(lower, eye.expand_as(lower), upper=False)
@@ -93,10 +94,12 @@ def corner_variance(box_px: Float[Tensor, " m"], config: PixelNoiseConfig) -> Fl
     return config.sigma_px**2 * (1 + (config.small_box_px / box_px).square())
 
 
-def box_scales(corners_px: Float[Tensor, "m 8 2"]) -> Float[Tensor, "m 16 2"]:
+def box_scales(
+    corners_px: Float[Tensor, "m 8 2"], shape: Int[Tensor, " m"]
+) -> Float[Tensor, "m 16 2"]:
     """Derivatives of the corners by the logarithms of the box's width and height; zero for outlines that are no boxes."""
     low, high = corners_px.amin(1, keepdim=True), corners_px.amax(1, keepdim=True)
-    offset = (corners_px - (low + high) / 2) * polygon.is_box(corners_px)[:, None, None]
+    offset = (corners_px - (low + high) / 2) * polygon.is_box(corners_px, shape)[:, None, None]
     return torch.diag_embed(offset).flatten(1, 2)
 
 

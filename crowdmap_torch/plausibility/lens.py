@@ -384,7 +384,8 @@ def _whitening(
     small = pixels.small_box_px
     factor = ((1 + (small / expected).square()) / (1 + (small / box).square())).sqrt()
     variance = shift[:, None].repeat(1, 6)
-    noise = detection_noise(seen.px, factor, by_pose, variance, torch.zeros_like(variance), pixels)
+    shape, unmoved = seen.shape[views.sign], torch.zeros_like(variance)
+    noise = detection_noise(seen.px, shape, factor, by_pose, variance, unmoved, pixels)
     leading = 2 * _POINTS
     counts = torch.arange(leading, device=box.device) < seen.numbers[:, None]
     return noise.whitening[:, :leading, :leading] * counts[:, :, None]

@@ -8,7 +8,7 @@ it does not see what all corners of a detection have wrong together.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import polygon
@@ -20,8 +20,6 @@ _AS_ASSUMED = 8.0
 """Pairs of views with the noise that is assumed that count beside those of a drive."""
 _OF_MOVES = 3
 """Numbers of an outline that moves and scale take: they tell of no noise."""
-_BOX_VARIANCE = 2.0
-"""Variance of the one shape that boxes have, that of their sides, in units of a side's."""
 
 
 def corner_noise(views: SignViews, shape: Int[Tensor, " n"], config: PixelNoiseConfig) -> float:
@@ -38,12 +36,24 @@ def corner_noise(views: SignViews, shape: Int[Tensor, " n"], config: PixelNoiseC
     extent = outline.square().sum((-2, -1), keepdim=True).sqrt().clamp_min(1e-9)
     # Both as large as the geometric mean of the two.
     change = (outline[0] / extent[0] - outline[1] / extent[1]) * (extent[0] * extent[1]).sqrt()
-    is_box = polygon.is_box(views.corners_px[first]) & polygon.is_box(views.corners_px[second])
+    is_box = polygon.is_box(views.corners_px, shape[views.sign])
+    is_box = is_box[first] & is_box[second]
     freedom = torch.where(is_box, 1.0, 2 * number[:, 0, 0] - _OF_MOVES)
-    variance = torch.where(is_box, _BOX_VARIANCE, freedom)
+    variance = torch.where(is_box, _of_sides(own), freedom)
     # The median of a chi-squared (Wilson and Hilferty 1931), of two views.
     expected = 2 * variance * (1 - 2 / (9 * freedom)) ** 3
     box = longer_side(views.corners_px)
     assumed = corner_variance((box[first] * box[second]).sqrt().clamp_min(1.0), config)
     ratio = change.square().sum((-2, -1)) / (expected * assumed)
     return max(usual(ratio, torch.ones_like(ratio), assumed=1.0, beside=_AS_ASSUMED) ** 0.5, 1.0)
+
+
+def _of_sides(shape: Int[Tensor, " p"]) -> Float[Tensor, " p"]:
+    """Mean squared change of the one form that square boxes have, of all corners together, in units of a side's variance.
+
+    Of a shape in a box of size one whose squared corners add up to A across and B up it is A B (dw - dh)^2 / (A + B), and
+    width and height are those of two sides each.
+    """
+    drawn = polygon.template(shape) * polygon.corner_mask(shape)[..., None]
+    across, up = drawn.square().sum(1).unbind(-1)
+    return 4 * across * up / (across + up)

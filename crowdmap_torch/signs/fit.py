@@ -358,7 +358,13 @@ def _noise(
     white = extra_variance.new_tensor((sigma_m, positioning.white_sigma_rad))
     variance = (white.square() + extra_variance).repeat_interleave(3, dim=-1)
     return detection_noise(
-        views.corners_px, noise_scale[views.sign], by_pose, variance, pose_error, config.pixels
+        views.corners_px,
+        shape[views.sign],
+        noise_scale[views.sign],
+        by_pose,
+        variance,
+        pose_error,
+        config.pixels,
     )
 
 

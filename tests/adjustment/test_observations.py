@@ -107,10 +107,12 @@ def test_frame_offsets_count_the_frames_before():
 
 @pytest.fixture
 def signs() -> Signs:
-    """One sign of each shape, side by side, facing west."""
+    """One sign of each shape, side by side, turned a little from the west: from straight ahead outlines would be boxes."""
     n = len(polygon.SHAPES)
     center = torch.stack((torch.full((n,), 30.0), 2.0 * torch.arange(n) - 5, torch.full((n,), 2.5)))
-    return Builder().signs(center.T.double(), shape=torch.arange(n))
+    facing = Builder().signs(center.T.double(), shape=torch.arange(n))
+    turned = torch.tensor([0, 0, 0, 0, 0.2, 0], dtype=torch.float64)
+    return replace(facing, T_world_sign=facing.T_world_sign @ se3.exp(turned))
 
 
 def seen(signs: Signs, rig: Rig, x: Tensor, shift: Tensor) -> tuple[Journey, Association]:
@@ -147,8 +149,6 @@ def seen(signs: Signs, rig: Rig, x: Tensor, shift: Tensor) -> tuple[Journey, Ass
 def corner_residuals(signs: Signs, journeys, associations) -> tuple[Tensor, Tensor]:
     """Pixel errors of all corner rows, and the sign of each."""
     rows = corner_observations(journeys, associations, signs, box_sigma=0.5)
-    # A sign seen from straight ahead is a box to the last digit, and its centre a row of its own.
-    rows = rows[rows.template.norm(dim=-1) > 0]
     T = torch.cat([j.T_world_camera for j in journeys])[rows.frame]
     of_sign = signs[rows.sign]
     error = vmap(sign_reprojection)(
@@ -204,9 +204,7 @@ def test_corners_of_a_detection_are_adjacent_and_numbered_over_all_journeys(sign
     begins = torch.cat((torch.zeros(1).long(), count.cumsum(0)[:-1]))
     for column in (rows.frame, rows.sign):
         assert torch.equal(column[begins].repeat_interleave(count), column)
-    is_centre = rows.template[begins].norm(dim=-1) == 0
-    expected = polygon.CORNER_COUNT[signs.shape[rows.sign[begins]]]
-    assert torch.equal(count, torch.where(is_centre, 1, expected))
+    assert torch.equal(count, polygon.CORNER_COUNT[signs.shape[rows.sign[begins]]])
 
 
 def test_journeys_without_signs_give_no_rows(signs: Signs):
@@ -219,31 +217,31 @@ def test_journeys_without_signs_give_no_rows(signs: Signs):
 
 
 @pytest.mark.parametrize("distortion", [None, LENS], ids=["pinhole", "distorted"])
-def test_of_boxes_the_centre_counts_and_the_corners_hardly(signs: Signs, distortion):
+@pytest.mark.parametrize("shape", SHAPES)
+def test_of_boxes_the_centre_counts_and_the_corners_hardly(signs: Signs, shape: str, distortion):
     rig = make_rig(distortion)
     journey, association = seen(signs, rig, metres(1, 1.0), torch.zeros(6).long())
-    rectangle = SHAPES.index("rectangle")
-    k = signs.shape.tolist().index(rectangle)
+    k = signs.shape.tolist().index(SHAPES.index(shape))
+    c = int(polygon.CORNER_COUNT[SHAPES.index(shape)])
     px = journey.signs.corners_px.clone()
     low, high = px[k].amin(0), px[k].amax(0)
-    corner = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]] + [[0, 1]] * 4, dtype=torch.float64)
-    px[k] = low + corner * (high - low)
+    px[k] = polygon.in_box(low, high, signs.shape[k])
     ideal, _ = camera.unproject(rig.camera, px)
     boxed = replace(journey.signs, corners_px=px, corners_ideal=ideal)
     rows = corner_observations([replace(journey, signs=boxed)], [association], signs, box_sigma=0.5)
     mine = rows[rows.sign == k]
-    assert len(mine) == 5
-    torch.testing.assert_close(mine.loose_px[:4], (high - low).max() / 4 * torch.ones(4).double())
-    assert mine.loose_px[4] == 0
-    # Taken for outlines they are four corners like any other.
+    assert len(mine) == c + 1
+    torch.testing.assert_close(mine.loose_px[:c], (high - low).max() / 4 * torch.ones(c).double())
+    assert mine.loose_px[c] == 0
+    # Taken for outlines they are corners like any other.
     alike = corner_observations(
         [replace(journey, signs=boxed)], [association], signs, box_sigma=0.0
     )
-    assert len(alike[alike.sign == k]) == 4 and not alike.loose_px.any()
-    torch.testing.assert_close(mine.template[4], torch.zeros(2).double(), rtol=0, atol=1e-12)
+    assert len(alike[alike.sign == k]) == c and not alike.loose_px.any()
+    torch.testing.assert_close(mine.template[c], torch.zeros(2).double(), rtol=0, atol=1e-12)
     # On the ray between those of the box's corners the error is zero.
-    ray = torch.cat((ideal[k, :4].mean(0), torch.ones(1).double()))
-    error = pixel_error(7 * ray, mine.matrix[4])
+    ray = torch.cat((ideal[k, :c].mean(0), torch.ones(1).double()))
+    error = pixel_error(7 * ray, mine.matrix[c])
     torch.testing.assert_close(error, torch.zeros(2).double(), rtol=0, atol=1e-9)
     others = rows[rows.sign != k]
     assert (others.loose_px == 0).all()

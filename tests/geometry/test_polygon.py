@@ -351,9 +351,17 @@ def test_no_signs_are_no_fault():
     assert polygon.best_shift(corners, corners, none)[0].shape == (0,)
 
 
-def test_a_box_is_axis_aligned_to_the_last_digit():
-    corner = torch.tensor([[3, 5], [9, 5], [9, 7], [3, 7]] + [[3, 7]] * 4, dtype=torch.float64)
-    tilted = corner.clone()
-    tilted[1, 1] += 1e-9
-    diamond = torch.tensor([[6, 5], [9, 6], [6, 7], [3, 6]] + [[3, 6]] * 4, dtype=torch.float64)
-    assert polygon.is_box(torch.stack((corner, tilted, diamond))).tolist() == [True, False, False]
+def test_a_box_has_its_shape_drawn_into_it_as_float32_has_it():
+    shape = torch.arange(len(polygon.SHAPES))
+    # Far to the right, corners beginning anywhere.
+    low = torch.tensor([1800.3, 700.7]).expand(len(shape), 2)
+    drawn = polygon.in_box(low, low + torch.tensor([60.2, 20.1]), shape).double()
+    count = polygon.corner_count(shape)
+    slot = (torch.arange(polygon.MAX_CORNERS) + 2).expand(len(shape), -1) % count[:, None]
+    turned = drawn.gather(1, slot[..., None].expand(-1, -1, 2))
+    assert polygon.is_box(turned, shape).all()
+    assert not polygon.is_box(turned, shape.roll(1)).any()
+    for corner in range(3):
+        beside = drawn.clone()
+        beside[:, corner] += 0.1
+        assert not polygon.is_box(beside, shape).any()

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from crowdmap_torch.geometry import polygon
 from crowdmap_torch.noise import pixels
 from crowdmap_torch.noise.pixels import (
     _CLASSES,
@@ -15,6 +16,7 @@ from crowdmap_torch.noise.pixels import (
 )
 
 CONFIG, F64 = PixelNoiseConfig(), torch.float64
+RECTANGLES = torch.tensor([polygon.RECTANGLE])
 M = 20_000
 
 
@@ -86,7 +88,7 @@ def noise_of(corners_px: torch.Tensor, factor: float, sigma_m: float) -> Detecti
     variance = torch.zeros(1, 6, dtype=F64)
     variance[:, 0] = sigma_m**2
     scale = torch.full((1,), factor, dtype=F64)
-    return detection_noise(corners_px, scale, by_pose, variance, 0 * variance, CONFIG)
+    return detection_noise(corners_px, RECTANGLES, scale, by_pose, variance, 0 * variance, CONFIG)
 
 
 def test_covariances_are_those_of_pixels_boxes_and_poses():
@@ -109,7 +111,7 @@ def test_many_detections_have_the_noise_of_each(monkeypatch, generator):
     variance = torch.rand(10, 6, dtype=F64, generator=generator)
 
     def found(some: slice) -> torch.Tensor:
-        known = corners[some], factor[some], by_pose[some]
+        known = corners[some], RECTANGLES.expand(10)[some], factor[some], by_pose[some]
         return detection_noise(*known, variance[some], variance[some], CONFIG).whitening
 
     monkeypatch.setattr(pixels, "_LOT", 4)
@@ -124,8 +126,20 @@ def test_many_detections_have_the_noise_of_each(monkeypatch, generator):
 def test_outlines_that_are_no_boxes_have_no_error_of_their_sides():
     tilted = box_of(40.0)
     tilted[..., 1] += 0.3 * tilted[..., 0]
-    assert box_scales(tilted).count_nonzero() == 0
-    assert box_scales(box_of(40.0)).count_nonzero() == 16
+    assert box_scales(tilted, RECTANGLES).count_nonzero() == 0
+    assert box_scales(box_of(40.0), RECTANGLES).count_nonzero() == 16
+
+
+def test_shapes_drawn_into_boxes_have_the_errors_of_the_boxes():
+    octagon = torch.tensor([polygon.OCTAGON])
+    low, high = torch.tensor([[300.0, 200.0]], dtype=F64), torch.tensor([[340.0, 230.0]], dtype=F64)
+    across, up = box_scales(polygon.in_box(low, high, octagon), octagon)[0].unbind(-1)
+    # A box 1 % wider, its middle where it was, has the corners that these derivatives say.
+    wider = torch.tensor([[0.2, 0.0]], dtype=F64)
+    moved = polygon.in_box(low - wider, high + wider, octagon)
+    moved = (moved - polygon.in_box(low, high, octagon)).flatten()
+    torch.testing.assert_close(0.01 * across, moved, rtol=0, atol=1e-9)
+    assert not up[::2].any() and up[1::2].abs().max() == 15.0
 
 
 def test_a_detection_moved_as_a_whole_is_its_poses_error():

@@ -19,17 +19,13 @@ HALF_PIXEL = 0.5
 """From the corner of a pixel, where boxes are often counted from, to its centre, FORMAT.md's (0, 0)."""
 BORDER_PX = 1.0
 """A box that comes closer to the image's border is taken for a sign that is cut off there."""
-_TEMPLATES = polygon.template(torch.arange(len(polygon.SHAPES))).numpy()
 _COUNT = polygon.CORNER_COUNT.tolist()
 
 
 def in_box(shape: int, box_px: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "8 2"]:
     """Corners of an upright, facing sign that fills a box u v width height."""
-    corners = _TEMPLATES[shape]
-    low, high = corners.min(0), corners.max(0)
-    share = (corners - low) / (high - low)
-    share[:, 1] = 1 - share[:, 1]  # y is up in the template, v is down in the image
-    return box_px[:2] + share * box_px[2:]
+    low, size = torch.from_numpy(np.asarray(box_px, dtype=np.float64)).split(2)
+    return polygon.in_box(low, low + size, torch.tensor(shape)).numpy()
 
 
 def clockwise(corners_px: Float[np.ndarray, "c 2"]) -> Float[np.ndarray, "8 2"]:
