@@ -279,6 +279,7 @@ _OF_POSES = {
     "utm": "UTM coordinates of zone {:.0f}, and rotations with them, turned into metres east, north, up",
     "heights": "{:g} m taken off z",
     "no-sigmas": "columns {of} left out",
+    "between-fixes": "x, y, z of frames that had those of the last fix put between the fixes",
 }
 
 CHANGES: dict[str, Change] = {

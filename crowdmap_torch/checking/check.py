@@ -145,6 +145,7 @@ _EXPLAINS: dict[str, tuple[tuple[Code, str], ...]] = {
     "frame-times": (("leap", ""), ("column-type", "t_ns")),
     "speed": (("leap", ""), ("far-away", "")),
     "quaternion-length": (("quaternion-length", ""),),
+    "held-positions": (("leap", ""),),
 }
 """What is said of a file that is refused for what a finding about its columns names: codes, with the column if it is one."""
 

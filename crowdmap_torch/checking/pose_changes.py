@@ -9,11 +9,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import torch
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
 
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.formats.composing.utm import convergence, geodetic_from_grid
 from crowdmap_torch.io.formats.geodesy import local_from_geodetic
 from crowdmap_torch.plausibility.finding import Repair
+from crowdmap_torch.plausibility.held import held_frames
 from crowdmap_torch.tables import Origin
 
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
@@ -122,6 +125,26 @@ def _no_sigmas(table: pa.Table, repair: Repair, origin: Origin) -> pa.Table:
     return table.drop_columns(left)
 
 
+def _between_fixes(table: pa.Table, repair: Repair, origin: Origin) -> pa.Table:
+    """Places of frames that had that of the last fix, on a cubic spline; rotations too where they were held with them."""
+    t, p = table.column("t_ns").to_numpy(), _columns(table, _POSITION)
+    # From the first frame on: seconds since 1970 would lose digits.
+    t = (t - t[0]) * 1e-9
+    is_held = held_frames(t, p)
+    known = t[~is_held]
+    inside = np.clip(t, known[0], known[-1])
+    spline = CubicSpline(known, p[~is_held], bc_type="natural")
+    # Behind the last fix a car goes on as it went.
+    beyond = (t - inside)[:, None] * spline(known[-1], 1)
+    table = _with(table, _POSITION, spline(inside) + beyond)
+    q = _columns(table, _QUATERNION)
+    after = np.flatnonzero(is_held)
+    if (q[after] == q[after - 1]).all():
+        turned = Slerp(known, Rotation.from_quat(q[~is_held]))(inside).as_quat()
+        table = _with(table, _QUATERNION, turned)
+    return table
+
+
 POSE_CHANGES: dict[str, Callable[[pa.Table, Repair, Origin], pa.Table]] = {
     "sort-frames": _sorted,
     "time-unit": _times,
@@ -134,5 +157,6 @@ POSE_CHANGES: dict[str, Callable[[pa.Table, Repair, Origin], pa.Table]] = {
     "utm": _utm,
     "heights": _heights,
     "no-sigmas": _no_sigmas,
+    "between-fixes": _between_fixes,
 }
 """By the name of the repair."""

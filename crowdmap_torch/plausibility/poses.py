@@ -174,7 +174,8 @@ def _heights(journey: Journey, origin: Origin, limits: PoseLimits) -> Iterator[F
 def _speeds(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
     if journey.frame_count < 2:
         return
-    position = journey.T_world_camera[:, :3, 3]
+    # Of the pose that files give: a camera beside it turns about what is held.
+    position = _links(journey)[:, :3, 3]
     named = [*unit_findings(journey.t_ns.double().numpy(), position.numpy(), limits.units)]
     if named:
         yield from named

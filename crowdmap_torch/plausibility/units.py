@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from crowdmap_torch.io.rigs import UNIT_TOLERANCE
 from crowdmap_torch.plausibility.finding import Finding, Repair
+from crowdmap_torch.plausibility.held import held_frames
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,16 @@ def unit_findings(
         yield finding
         if not units:
             return
-    speed = usual_speed(t_ns * 1e-9 * factor, position, limits)
+    is_held = held_frames(t_ns, position)
+    if is_held.any():
+        yield Finding(
+            "held-positions",
+            f"while the car drives, {is_held.mean():.0%} of its frames are where the one before was, and then it leaps",
+            "positions are those of the last fix",
+            "write the place of each frame, between two fixes if need be",
+            repair=Repair("between-fixes"),
+        )
+    speed = usual_speed((t_ns * 1e-9 * factor)[~is_held], position[~is_held], limits)
     if speed is not None and speed > limits.fastest_mps:
         low, high = limits.usual_mps
         yield _speed(speed, [(u, f) for u, f in LENGTH_UNITS if low <= speed * f <= high])

@@ -263,6 +263,12 @@ def _no_sigmas(c: dict) -> dict:
     return c | {name: zero for name in ("sigma_e", "sigma_n", "sigma_u", "sigma_rot")}
 
 
+def _last_fix(c: dict) -> dict:
+    """A receiver with a third of the camera's rate, joined by the last fix before each frame."""
+    row = [k - k % 3 for k in range(len(c["frame"]))]
+    return c | {name: [c[name][k] for k in row] for name in POSITION + QUATERNION}
+
+
 def _overlap(folder: Path) -> None:
     """The first drive becomes two, which share an eighth of its frames."""
     first = sorted((folder / "journeys").iterdir())[0]
@@ -428,6 +434,9 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "no-sigmas": Mistake(
         "sigmas", lambda folder: _each(folder, "poses", _no_sigmas), "does not know"
+    ),
+    "last-fix": Mistake(
+        "held-positions", lambda folder: _each(folder, "poses", _last_fix), "of the last fix"
     ),
     "overlap": Mistake("overlap", _overlap, "cut into journeys"),
     "copy": Mistake("copy", _copied, "more than once"),
