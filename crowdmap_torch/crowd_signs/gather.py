@@ -11,14 +11,10 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.groups import distinct_pairs, pairs_within
 from crowdmap_torch.geometry.trajectory import station as along_track
+from crowdmap_torch.noise.leaps import largest_leap
 from crowdmap_torch.noise.stated_sigmas import stated_sigmas
 from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.tables import Journey, Signs, Tracklets, concatenate
-
-_FASTEST_MPS = 70.0
-"""No car is faster [m/s]: a longer step between two frames is a fault of the positions."""
-_HARDEST_MPS2 = 12.0
-"""Acceleration [m/s^2] that no car exceeds."""
 
 _SOME_CONFIDENCE = 1e-9
 """Least confidence of a sign that is not doubtful: detectors may give all scores as zero."""
@@ -115,7 +111,7 @@ def gather_signs(
     for j, (journey, found) in enumerate(zip(journeys, tracklets, strict=True)):
         rows = torch.nonzero(signs.journey == j)[:, 0]
         distance = along_track(journey.T_world_camera)
-        leap[j] = largest_leap(journey)
+        leap[j] = largest_leap(journey.T_world_camera[:, :3, 3], journey.t_ns)
         frame = signs.frame[rows]
         station[rows] = distance[frame]
         view[rows] = journey.T_world_camera[frame]
@@ -178,34 +174,6 @@ def pairs_seen_together(
     low, high, _ = distinct_pairs(torch.minimum(a, b), torch.maximum(a, b))
     pairs = torch.stack((low, high), dim=1)
     return pairs[low != high]
-
-
-def largest_leap(journey: Journey) -> Float[Tensor, ""]:
-    """Largest step [m] beyond what the steps before and behind it, and a car's brakes and tyres, explain.
-
-    By their times or by their lengths: times say why the step over a gap in the frames is long, lengths that a step is
-    like the others whatever its times.
-    """
-    position = journey.T_world_camera[:, :3, 3]
-    step = position.diff(dim=0)
-    seconds = journey.t_ns.diff().to(step) * 1e-9
-    if len(step) < 2:
-        return (step.norm(dim=1) - _FASTEST_MPS * seconds).clamp_min(0).sum()
-    velocity = step / seconds[:, None]
-    # The speed of a step is that of its middle: from there to the next step's middle it may change.
-    change = _HARDEST_MPS2 * (seconds[1:] + seconds[:-1]) / 2
-    faster = (velocity.diff(dim=0).norm(dim=1) - change).clamp_min(0)
-    by_time = _against_both(faster) * seconds
-    return torch.minimum(by_time, _against_both(step.diff(dim=0).norm(dim=1))).max()
-
-
-def _against_both(change: Float[Tensor, " f"]) -> Float[Tensor, " g"]:
-    """The lesser of a step's changes from the step before and to the one behind it.
-
-    A leap stands out against both of its neighbours, a car that pulls away after one does not.
-    """
-    none = change.new_full((1,), torch.inf)
-    return torch.minimum(torch.cat((none, change)), torch.cat((change, none)))
 
 
 def with_covariance(signs: Signs, extra: Float[Tensor, "n 3 3"]) -> Signs:

@@ -23,6 +23,7 @@ from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.poses import read_poses
 from crowdmap_torch.io.rigs import read_rig
+from crowdmap_torch.noise.leaps import without_leaps
 from crowdmap_torch.processes.at_rest import rest
 from crowdmap_torch.ranges import shown
 from crowdmap_torch.tables import Dataset, Journey, Origin, RejectedJourney, Rig
@@ -202,12 +203,13 @@ def _load_journey(
     frame_number = poses.frame_number.numpy()
     signs = read_sign_detections(folder / "signs.parquet", rig.camera, frame_number)
     lanes = read_lane_detections(folder / "lanes.parquet", rig.camera, frame_number)
+    T_world_link, leaps_m = without_leaps(poses.T_world_link, poses.t_ns)
     journey = Journey(
         journey_id=journey_id,
         rig=rig,
         frame_number=poses.frame_number,
         t_ns=poses.t_ns,
-        T_world_camera=poses.T_world_link @ rig.T_link_camera,
+        T_world_camera=T_world_link @ rig.T_link_camera,
         sigma_position=poses.sigma_position,
         sigma_rotation=poses.sigma_rotation,
         signs=signs.detections,
@@ -215,6 +217,7 @@ def _load_journey(
         lane_points=lanes.points,
         dropped=signs.dropped | lanes.dropped,
         vehicle_id=_vehicle_id(head.content.get("vehicle_id")),
+        leaps_m=tuple(leaps_m.tolist()),
     )
     return journey, signs.type_names
 

@@ -33,7 +33,12 @@ from crowdmap_torch.plausibility.lever import (
     lever_of,
     said_of_lever,
 )
-from crowdmap_torch.plausibility.poses import axes_alike, in_kilometres, pose_findings
+from crowdmap_torch.plausibility.poses import (
+    LEAPS_TAKEN_OUT,
+    axes_alike,
+    in_kilometres,
+    pose_findings,
+)
 from crowdmap_torch.plausibility.rig import rig_findings
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.processes.workers import Call
@@ -159,7 +164,7 @@ def _of_signs(
     return [(j.journey_id, by_lens[is_bare(j.rig)]) for j in sound if is_bare(j.rig) in by_lens]
 
 
-_HARMLESS = ("sigmas", "overlap", "road-normal", "camera-height", "leap")
+_HARMLESS = ("sigmas", "overlap", "road-normal", "camera-height", "leap", LEAPS_TAKEN_OUT)
 """Findings that do not keep the rays to a sign from meeting."""
 
 

@@ -60,6 +60,8 @@ _AXES = {
     "x ahead, y left, z up": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
     "x ahead, y right, z down": ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
 }
+LEAPS_TAKEN_OUT = "leaps-taken-out"
+"""Kind of the finding that tells of leaps that a map does without."""
 _UPRIGHT = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 """The same of a camera as OpenGL has it: x right, y up, z back."""
 _DEGREE_M = 111e3
@@ -80,6 +82,7 @@ def pose_findings(
     return [
         *_heights(journey, origin, limits),
         *_speeds(journey, limits),
+        *_leaps(journey),
         *_sigmas(journey, limits),
         *_rounded(journey, limits),
         *_axes(journey, limits),
@@ -193,6 +196,17 @@ def _speeds(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
             f"{float(seconds[first]):.2f} s",
             "positioning lost its way, or two drives stand in one file",
             "cut the journey there",
+        )
+
+
+def _leaps(journey: Journey) -> Iterator[Finding]:
+    if journey.leaps_m:
+        times = "once" if len(journey.leaps_m) == 1 else f"{len(journey.leaps_m)} times"
+        yield Finding(
+            LEAPS_TAKEN_OUT,
+            f"positions leap {times} between two frames, by {max(journey.leaps_m):.1f} m at most",
+            "positioning changed its mind, by other satellites or behind a bridge",
+            "nothing: the drive is put together again where it leaps",
         )
 
 

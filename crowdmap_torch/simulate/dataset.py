@@ -139,8 +139,7 @@ def make_journey(
         drive.distance, config.positioning, np.random.default_rng([config.seed, _DRIVE, index])
     )
     error = pose_errors(drive.distance, config.positioning, pose_rng)
-    if wrong.outage is not None or wrong.wander is not None:
-        error = replace(error, translation=error.translation + wrong.shift(drive.distance))
+    error = replace(error, translation=error.translation + wrong.shift(drive.distance))
     T_reported = measured_poses(_stamped_poses(drive, vehicle), error)
     true_camera = vehicle.true_rig.camera
     seen_from, camera = faults.with_sensor_fault(drive, true_camera, fault, fault_rng)

@@ -1,4 +1,4 @@
-"""The positioning module: true poses with a bias that may wander, a drift, white noise and outages; its own sigmas."""
+"""The positioning module: true poses with a bias that may wander, drift, white noise, outages and leaps; its own sigmas."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from crowdmap_torch.ranges import (
     LengthOrNone,
     Offset,
     Range,
+    Rate,
     Settings,
     Share,
     Span,
@@ -78,6 +79,10 @@ class PositioningConfig(Settings):
     """Shortest and longest, at most 0.6 of the drive."""
     outage_m: LengthOrNone = 3.0
     """How far the position wanders off; that of an outage is half as far to half as far again."""
+    leaps_per_km: Rate = 0.0
+    """How often the position leaps between two frames, and goes on from there; no sigma says so."""
+    leap_m: LengthOrNone = 1.5
+    """1-sigma of how far, east, north and up alike."""
     sigmas: bool = True
     """False: the sigma columns are left out."""
 
@@ -141,6 +146,21 @@ class Wander:
 
 
 @dataclass(frozen=True)
+class Leaps:
+    """Where a drive's position leaps between two frames, and goes on from there."""
+
+    at_m: tuple[float, ...]
+    """Way travelled."""
+    by_m: tuple[tuple[float, float, float], ...]
+    """How far: east, north, up."""
+
+    def shift(self, distance: Float[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
+        """Error of the position at the frames [m]: all leaps so far."""
+        behind = distance[:, None] > np.array(self.at_m)
+        return behind.astype(np.float64) @ np.array(self.by_m).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
 class DriveErrors:
     """What is wrong with the positioning of one drive, and is not said."""
 
@@ -148,11 +168,13 @@ class DriveErrors:
     """Stated sigmas are the true ones times this, and times `sigma_scale`."""
     outage: Outage | None
     wander: Wander | None = None
+    leaps: Leaps | None = None
 
     def shift(self, distance: Float[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
         """Error of the position at the frames [m], by way travelled."""
-        parts = [part.shift(distance) for part in (self.outage, self.wander) if part is not None]
-        return np.sum(parts, axis=0) if parts else np.zeros((len(distance), 3))
+        parts = (self.outage, self.wander, self.leaps)
+        shifts = [part.shift(distance) for part in parts if part is not None]
+        return np.sum(shifts, axis=0) if shifts else np.zeros((len(distance), 3))
 
 
 def drive_errors(
@@ -174,9 +196,19 @@ def drive_errors(
     outage = Outage(float(begin), float(begin + length), away, sway)
     # Drawn last: the rest of a drive is the same with and without it.
     wander = _wander(distance, config, rng) if config.bias_wander_m else None
+    leaps = _leaps(distance, config, rng) if config.leaps_per_km and config.leap_m else None
     return DriveErrors(
-        float(np.exp(log_factor)), outage if has_outage and size > 0 else None, wander
+        float(np.exp(log_factor)), outage if has_outage and size > 0 else None, wander, leaps
     )
+
+
+def _leaps(
+    distance: Float[np.ndarray, " f"], config: PositioningConfig, rng: np.random.Generator
+) -> Leaps:
+    count = rng.poisson(config.leaps_per_km * distance[-1] / 1000)
+    at = np.sort(rng.uniform(0, distance[-1], count))
+    by = config.leap_m * rng.normal(size=(count, 3))
+    return Leaps(tuple(at.tolist()), tuple((float(e), float(n), float(u)) for e, n, u in by))
 
 
 def _wander(

@@ -1,4 +1,4 @@
-"""Leaps of a journey's positions, and signs seen beside each other."""
+"""Signs seen beside each other, and what is doubtful among those of a crowd."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from worlds.drives import without_detections
 from worlds.sign_drive import (
     SignDrive,
     drive_past,
@@ -20,60 +19,13 @@ from worlds.sign_drive import (
 
 from crowdmap_torch import mapper
 from crowdmap_torch.config import MapperConfig
-from crowdmap_torch.crowd_signs.gather import largest_leap, pairs_seen_together, signs_of_crowd
+from crowdmap_torch.crowd_signs.gather import pairs_seen_together, signs_of_crowd
 from crowdmap_torch.mapper import FirstMap
-from crowdmap_torch.tables import Dataset, Journey
+from crowdmap_torch.tables import Dataset
 
 PLACES = [(3.5 * (-1) ** i, 60.0 + 25.0 * i, 2.5) for i in range(6)]
 MOMENT = 3
 """The sign that is seen for a moment."""
-
-
-def moved(journey: Journey, frame: int, by: list[float]) -> Journey:
-    """The journey whose positions are off from a frame on."""
-    T = journey.T_world_camera.clone()
-    T[frame:, :3, 3] += torch.tensor(by, dtype=T.dtype)
-    return replace(journey, T_world_camera=T)
-
-
-def test_ordinary_drives_do_not_leap(tiny: Dataset):
-    for journey in tiny.journeys:
-        assert float(largest_leap(journey)) < 0.3
-
-
-@pytest.mark.parametrize("by", [[8.0, 0.0, 0.0], [0.0, -8.0, 0.0], [-6.0, 6.0, 0.0]])
-def test_a_jump_in_any_direction_is_a_leap_of_its_length(tiny: Dataset, by: list[float]):
-    journey = tiny.journeys[0]
-    leap = float(largest_leap(moved(journey, journey.frame_count // 2, by)))
-    # Less what brakes and tyres might explain, and the noise of the positions: some centimetres a frame.
-    assert leap == pytest.approx(torch.tensor(by).norm().item(), abs=0.5)
-
-
-def test_a_gap_in_the_frames_is_no_leap(tiny: Dataset):
-    journey = tiny.journeys[0]
-    kept = torch.ones(journey.frame_count, dtype=torch.bool)
-    kept[journey.frame_count // 2 : journey.frame_count // 2 + 30] = False
-    gapped = without_detections(journey, kept.nonzero()[:, 0])
-    assert float(largest_leap(gapped)) < 0.5
-
-
-def test_times_that_jitter_are_no_leap(tiny: Dataset, generator: torch.Generator):
-    journey = tiny.journeys[0]
-    late = 1e8 * torch.rand(journey.frame_count, generator=generator, dtype=torch.float64)
-    # Still one after the other, some of them a millisecond apart.
-    t_ns = (journey.t_ns + late.long()).cummax(0)[0] + 10**6 * torch.arange(journey.frame_count)
-    jittered = replace(journey, t_ns=t_ns)
-    assert float(largest_leap(jittered)) < 0.5
-    jump = moved(jittered, journey.frame_count // 2, [8.0, 0.0, 0.0])
-    # Of a step that seems to have taken a tenth of a second more, brakes explain more.
-    assert float(largest_leap(jump)) == pytest.approx(8.0, abs=1.5)
-
-
-def test_one_or_two_frames_do_not_leap(tiny: Dataset):
-    journey = tiny.journeys[0]
-    for count in (0, 1, 2):
-        short = without_detections(journey, torch.arange(count))
-        assert float(largest_leap(short)) == 0.0
 
 
 def test_pairs_seen_together_are_beside_each_other_in_a_frame():

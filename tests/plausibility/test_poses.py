@@ -77,6 +77,13 @@ def test_a_leap_is_named_with_its_frames() -> None:
     assert "frames 29 and 30" in found.evidence
 
 
+def test_leaps_that_a_map_does_without_are_told() -> None:
+    journey = drive(torch.zeros(60).double())
+    (found,) = pose_findings(replace(journey, leaps_m=(1.2, 2.4)), ORIGIN)
+    assert (found.kind, found.repair) == ("leaps-taken-out", None)
+    assert "2 times" in found.evidence and "2.4 m" in found.evidence
+
+
 def test_times_in_another_unit_are_named() -> None:
     journey = drive(torch.zeros(60).double())
     assert kinds(replace(journey, t_ns=journey.t_ns // 1000)) == ["frame-times"]

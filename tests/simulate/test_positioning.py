@@ -192,6 +192,36 @@ def test_a_bias_that_wanders_has_its_sigma_and_forgets_itself_over_its_length():
     np.testing.assert_allclose(position**2, plain**2 + 1.0)
 
 
+def test_positions_leap_as_often_and_as_far_as_they_are_told():
+    config = replace(PAPER, leaps_per_km=2.0, leap_m=1.5)
+    distance = np.linspace(0.0, 2000.0, 4001)
+    drawn = [drive_errors(distance, config, np.random.default_rng(k)).leaps for k in range(400)]
+    leaps = [leap for leap in drawn if leap is not None]
+    assert len(leaps) == 400
+    # 1,600 of them: their number is known to 2.5 %, their sigma to 1.
+    assert np.mean([len(leap.at_m) for leap in leaps]) == pytest.approx(4.0, rel=0.1)
+    assert np.concatenate([leap.by_m for leap in leaps if leap.by_m]).std() == pytest.approx(
+        1.5, rel=0.05
+    )
+    one = next(leap for leap in leaps if len(leap.at_m) == 3)
+    step = np.diff(one.shift(distance), axis=0)
+    at = np.flatnonzero(np.abs(step).sum(-1))
+    np.testing.assert_allclose(distance[at], one.at_m, atol=0.5)
+    np.testing.assert_allclose(step[at], one.by_m)
+    assert not one.shift(distance[:1]).any()
+
+
+def test_what_else_is_drawn_of_a_drive_does_not_depend_on_whether_its_position_leaps():
+    config = replace(PAPER, outages=1.0, bias_wander_m=1.0)
+    distance = np.array([0.0, 2500.0])
+    still, leaping = (
+        drive_errors(distance, c, np.random.default_rng(4))
+        for c in (config, replace(config, leaps_per_km=4.0))
+    )
+    assert still.leaps is None and leaping.leaps is not None
+    assert replace(leaping, leaps=None) == still
+
+
 def test_what_else_is_drawn_of_a_drive_does_not_depend_on_whether_its_bias_wanders():
     config = replace(PAPER, outages=1.0, sigma_spread=1.5)
     distance = np.array([0.0, 2500.0])
