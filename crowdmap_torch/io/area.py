@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from crowdmap_torch.io.detections import DROPPED_LANE, DROPPED_SIGN
+from crowdmap_torch.io.detections import seen_in
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.truth import JourneyTruth, Truth
 from crowdmap_torch.ranges import shown
@@ -147,14 +147,7 @@ def cut_journey(journey: Journey, area: Area) -> Journey:
     """
     near = _near(journey, area)
     first, end = _visit(near)
-    has_sign, has_lane = near[journey.signs.frame], near[journey.lanes.frame]
-    has_point = has_lane[journey.lane_points.detection]
-    signs, lanes = journey.signs[has_sign], journey.lanes[has_lane]
-    points = journey.lane_points[has_point]
-    left = {
-        f"{DROPPED_SIGN}{OUTSIDE}": len(journey.signs) - len(signs),
-        f"{DROPPED_LANE}{OUTSIDE}": len(journey.lanes) - len(lanes),
-    }
+    journey = seen_in(journey, near, OUTSIDE)
 
     def of_frames(column: Tensor | None) -> Tensor | None:
         return None if column is None else column[first:end]
@@ -166,10 +159,8 @@ def cut_journey(journey: Journey, area: Area) -> Journey:
         T_world_camera=journey.T_world_camera[first:end],
         sigma_position=of_frames(journey.sigma_position),
         sigma_rotation=of_frames(journey.sigma_rotation),
-        signs=replace(signs, frame=signs.frame - first),
-        lanes=replace(lanes, frame=lanes.frame - first),
-        lane_points=replace(points, detection=(has_lane.long().cumsum(0) - 1)[points.detection]),
-        dropped=journey.dropped | {reason: count for reason, count in left.items() if count},
+        signs=replace(journey.signs, frame=journey.signs.frame - first),
+        lanes=replace(journey.lanes, frame=journey.lanes.frame - first),
     )
 
 

@@ -16,13 +16,16 @@ from crowdmap_torch.io.copies import SAME_PX, copies
 from crowdmap_torch.io.detections import (
     DROPPED_LANE,
     DROPPED_SIGN,
+    FROZEN,
     read_lane_detections,
     read_sign_detections,
+    seen_in,
 )
 from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.poses import read_poses
 from crowdmap_torch.io.rigs import read_rig
+from crowdmap_torch.noise.freezes import driven_on, frozen_frames
 from crowdmap_torch.noise.leaps import without_leaps
 from crowdmap_torch.processes.at_rest import rest
 from crowdmap_torch.ranges import shown
@@ -203,7 +206,10 @@ def _load_journey(
     frame_number = poses.frame_number.numpy()
     signs = read_sign_detections(folder / "signs.parquet", rig.camera, frame_number)
     lanes = read_lane_detections(folder / "lanes.parquet", rig.camera, frame_number)
-    T_world_link, leaps_m = without_leaps(poses.T_world_link, poses.t_ns)
+    T_world_link, frozen = poses.T_world_link, frozen_frames(poses.T_world_link, poses.t_ns)
+    if bool(frozen.any()):
+        T_world_link = driven_on(T_world_link, poses.t_ns, frozen)
+    T_world_link, leaps_m = without_leaps(T_world_link, poses.t_ns)
     journey = Journey(
         journey_id=journey_id,
         rig=rig,
@@ -219,6 +225,8 @@ def _load_journey(
         vehicle_id=_vehicle_id(head.content.get("vehicle_id")),
         leaps_m=tuple(leaps_m.tolist()),
     )
+    if bool(frozen.any()):
+        journey = seen_in(journey, ~frozen, FROZEN)
     return journey, signs.type_names
 
 

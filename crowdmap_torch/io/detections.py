@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +23,12 @@ from crowdmap_torch.io.columns import Lists, Sheet
 from crowdmap_torch.io.errors import Code
 from crowdmap_torch.io.row_order import points_by_place, rank_of_lists, rows_by_content
 from crowdmap_torch.io.writing import list_column, name_column, write_parquet
-from crowdmap_torch.tables import LANE_TYPES, LaneDetections, LanePoints, SignDetections
+from crowdmap_torch.tables import LANE_TYPES, Journey, LaneDetections, LanePoints, SignDetections
 
 DROPPED_SIGN, DROPPED_LANE, DROPPED_LANE_POINT = "sign: ", "lane: ", "lane point: "
 """How the reasons of `Journey.dropped` begin; rows of a file were dropped for the first two."""
+FROZEN = "in a frame whose pose is frozen"
+"""How that of detections ends that are left out with their frame."""
 _DROPPED: dict[Code, str] = {
     "outside-image": "outside the image",
     "no-area": "no area",
@@ -315,3 +317,21 @@ def _extent(
         high, low = (reduce.reduceat(px, first) for reduce in (np.maximum, np.minimum))
         extent[row[first]] = (high - low).max(-1)
     return extent
+
+
+def seen_in(journey: Journey, used: Bool[Tensor, " f"], reason: str) -> Journey:
+    """What was detected in the frames that are `used`; rows keep their numbers, those left out are counted for `reason`."""
+    has_sign, has_lane = used[journey.signs.frame], used[journey.lanes.frame]
+    signs, lanes = journey.signs[has_sign], journey.lanes[has_lane]
+    points = journey.lane_points[has_lane[journey.lane_points.detection]]
+    left = {
+        f"{DROPPED_SIGN}{reason}": len(journey.signs) - len(signs),
+        f"{DROPPED_LANE}{reason}": len(journey.lanes) - len(lanes),
+    }
+    return replace(
+        journey,
+        signs=signs,
+        lanes=lanes,
+        lane_points=replace(points, detection=(has_lane.long().cumsum(0) - 1)[points.detection]),
+        dropped=journey.dropped | {reason: count for reason, count in left.items() if count},
+    )

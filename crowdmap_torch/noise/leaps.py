@@ -27,7 +27,7 @@ _TURNS_RADPS = 1.0
 """No car turns faster: where rotations do the drive does not go on behind a leap."""
 _LOOKS_ON_RAD = 0.05
 """Noise of rotations from one frame to the next that is none."""
-_MOST_OFTEN = 0.02
+_MOST_OFTEN = 0.05
 """Where more steps leap positions are not those of each frame."""
 _HALF_WINDOW = 3
 """Steps before and behind one whose median is how the car drives there."""

@@ -34,6 +34,7 @@ from crowdmap_torch.plausibility.lever import (
     said_of_lever,
 )
 from crowdmap_torch.plausibility.poses import (
+    FRAMES_LEFT_OUT,
     LEAPS_TAKEN_OUT,
     axes_alike,
     in_kilometres,
@@ -164,7 +165,15 @@ def _of_signs(
     return [(j.journey_id, by_lens[is_bare(j.rig)]) for j in sound if is_bare(j.rig) in by_lens]
 
 
-_HARMLESS = ("sigmas", "overlap", "road-normal", "camera-height", "leap", LEAPS_TAKEN_OUT)
+_HARMLESS = (
+    "sigmas",
+    "overlap",
+    "road-normal",
+    "camera-height",
+    "leap",
+    FRAMES_LEFT_OUT,
+    LEAPS_TAKEN_OUT,
+)
 """Findings that do not keep the rays to a sign from meeting."""
 
 

@@ -45,4 +45,7 @@ def held_frames(
     until = np.append(t[fix[1:]], t[fix[-1]] + longest if drives[-1] else -np.inf)
     last = np.searchsorted(fix, np.arange(len(t)), side="right") - 1
     is_fresh = np.isin(np.arange(len(t)), fix)
-    return ~is_fresh & (until[last] - t < longest) & (until[last] > t)
+    is_held = ~is_fresh & (until[last] - t < longest) & (until[last] > t)
+    # Poses that froze now and then are held for longer than is usual.
+    share = is_held.sum() / (is_held.sum() + drives.sum())
+    return is_held if share >= _LEAST_SHARE else none

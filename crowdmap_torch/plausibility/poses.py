@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
+from crowdmap_torch.io.detections import FROZEN
 from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.plausibility.finding import Finding, Repair
 from crowdmap_torch.plausibility.units import UnitLimits, unit_findings, usual_speed
@@ -62,6 +63,8 @@ _AXES = {
 }
 LEAPS_TAKEN_OUT = "leaps-taken-out"
 """Kind of the finding that tells of leaps that a map does without."""
+FRAMES_LEFT_OUT = "frozen-poses"
+"""Kind of the finding that tells of frames whose detections a map does without."""
 _UPRIGHT = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 """The same of a camera as OpenGL has it: x right, y up, z back."""
 _DEGREE_M = 111e3
@@ -82,6 +85,7 @@ def pose_findings(
     return [
         *_heights(journey, origin, limits),
         *_speeds(journey, limits),
+        *_freezes(journey),
         *_leaps(journey),
         *_sigmas(journey, limits),
         *_rounded(journey, limits),
@@ -196,6 +200,17 @@ def _speeds(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
             f"{float(seconds[first]):.2f} s",
             "positioning lost its way, or two drives stand in one file",
             "cut the journey there",
+        )
+
+
+def _freezes(journey: Journey) -> Iterator[Finding]:
+    left = sum(count for reason, count in journey.dropped.items() if reason.endswith(FROZEN))
+    if left:
+        yield Finding(
+            FRAMES_LEFT_OUT,
+            f"positions stay where they are while the car drives on, and {left} detections are in such frames",
+            "positioning was lost for a moment",
+            "nothing: these detections are left out",
         )
 
 

@@ -141,6 +141,8 @@ def make_journey(
     error = pose_errors(drive.distance, config.positioning, pose_rng)
     error = replace(error, translation=error.translation + wrong.shift(drive.distance))
     T_reported = measured_poses(_stamped_poses(drive, vehicle), error)
+    if wrong.freezes is not None:
+        T_reported = wrong.freezes.held(T_reported, drive.distance, drive.t)
     true_camera = vehicle.true_rig.camera
     seen_from, camera = faults.with_sensor_fault(drive, true_camera, fault, fault_rng)
     claimed = faults.with_upload_fault(world.signs, fault, fault_rng)

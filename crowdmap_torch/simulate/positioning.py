@@ -1,4 +1,4 @@
-"""The positioning module: true poses with a bias that may wander, drift, white noise, outages and leaps; its own sigmas."""
+"""The positioning module: true poses with a wandering bias, drift, noise, outages, leaps and freezes; its own sigmas."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from crowdmap_torch.ranges import (
     Offset,
     Range,
     Rate,
+    Seconds,
     Settings,
     Share,
     Span,
@@ -83,6 +84,10 @@ class PositioningConfig(Settings):
     """How often the position leaps between two frames, and goes on from there; no sigma says so."""
     leap_m: LengthOrNone = 1.5
     """1-sigma of how far, east, north and up alike."""
+    freezes_per_km: Rate = 0.0
+    """How often a pose stays what it is while the car drives on, and is then right again; no sigma says so."""
+    freeze_s: Seconds = 2.0
+    """For how long."""
     sigmas: bool = True
     """False: the sigma columns are left out."""
 
@@ -161,6 +166,28 @@ class Leaps:
 
 
 @dataclass(frozen=True)
+class Freezes:
+    """Where a drive's pose stays what it is while the car drives on."""
+
+    at_m: tuple[float, ...]
+    """Way travelled."""
+    lasts_s: float
+
+    def held(
+        self,
+        T: Float[np.ndarray, "f 4 4"],
+        distance: Float[np.ndarray, " f"],
+        t: Float[np.ndarray, " f"],
+    ) -> Float[np.ndarray, "f 4 4"]:
+        """The poses with those meanwhile as the one before."""
+        T = T.copy()
+        for first in np.searchsorted(distance, self.at_m).clip(0, len(t) - 1):
+            meanwhile = (t > t[first]) & (t <= t[first] + self.lasts_s)
+            T[meanwhile] = T[first]
+        return T
+
+
+@dataclass(frozen=True)
 class DriveErrors:
     """What is wrong with the positioning of one drive, and is not said."""
 
@@ -169,6 +196,7 @@ class DriveErrors:
     outage: Outage | None
     wander: Wander | None = None
     leaps: Leaps | None = None
+    freezes: Freezes | None = None
 
     def shift(self, distance: Float[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
         """Error of the position at the frames [m], by way travelled."""
@@ -197,9 +225,17 @@ def drive_errors(
     # Drawn last: the rest of a drive is the same with and without it.
     wander = _wander(distance, config, rng) if config.bias_wander_m else None
     leaps = _leaps(distance, config, rng) if config.leaps_per_km and config.leap_m else None
-    return DriveErrors(
-        float(np.exp(log_factor)), outage if has_outage and size > 0 else None, wander, leaps
-    )
+    freezes = _freezes(distance, config, rng) if config.freezes_per_km else None
+    outage = outage if has_outage and size > 0 else None
+    return DriveErrors(float(np.exp(log_factor)), outage, wander, leaps, freezes)
+
+
+def _freezes(
+    distance: Float[np.ndarray, " f"], config: PositioningConfig, rng: np.random.Generator
+) -> Freezes:
+    count = rng.poisson(config.freezes_per_km * distance[-1] / 1000)
+    at = np.sort(rng.uniform(0, distance[-1], count))
+    return Freezes(tuple(at.tolist()), config.freeze_s)
 
 
 def _leaps(

@@ -211,15 +211,32 @@ def test_positions_leap_as_often_and_as_far_as_they_are_told():
     assert not one.shift(distance[:1]).any()
 
 
+def test_poses_freeze_as_often_and_as_long_as_they_are_told():
+    config = replace(PAPER, freezes_per_km=2.0, freeze_s=1.5)
+    distance = np.linspace(0.0, 2000.0, 2001)
+    t = distance / 10.0
+    drawn = [drive_errors(distance, config, np.random.default_rng(k)).freezes for k in range(400)]
+    freezes = [freeze for freeze in drawn if freeze is not None]
+    assert np.mean([len(freeze.at_m) for freeze in freezes]) == pytest.approx(4.0, rel=0.1)
+    T = np.tile(np.eye(4), (len(t), 1, 1))
+    T[:, 0, 3] = distance
+    one = next(f for f in freezes if len(f.at_m) == 2 and f.at_m[1] - f.at_m[0] > 50 < f.at_m[0])
+    held = one.held(T, distance, t)
+    # Every 0.1 s a frame: 15 behind each that is held.
+    rows = np.ceil(one.at_m).astype(int)[:, None] + np.arange(1, 16)
+    assert np.flatnonzero(held[:, 0, 3] != distance).tolist() == rows.ravel().tolist()
+    assert (held[rows, 0, 3] == np.ceil(one.at_m)[:, None]).all()
+
+
 def test_what_else_is_drawn_of_a_drive_does_not_depend_on_whether_its_position_leaps():
     config = replace(PAPER, outages=1.0, bias_wander_m=1.0)
     distance = np.array([0.0, 2500.0])
     still, leaping = (
         drive_errors(distance, c, np.random.default_rng(4))
-        for c in (config, replace(config, leaps_per_km=4.0))
+        for c in (config, replace(config, leaps_per_km=4.0, freezes_per_km=2.0))
     )
-    assert still.leaps is None and leaping.leaps is not None
-    assert replace(leaping, leaps=None) == still
+    assert still.leaps is None and leaping.leaps is not None and leaping.freezes is not None
+    assert replace(leaping, leaps=None, freezes=None) == still
 
 
 def test_what_else_is_drawn_of_a_drive_does_not_depend_on_whether_its_bias_wanders():
