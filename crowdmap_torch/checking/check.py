@@ -16,13 +16,14 @@ from crowdmap_torch.io.inspection import inspect_dataset
 from crowdmap_torch.plausibility.dataset import look_over
 from crowdmap_torch.plausibility.finding import Finding, Repair
 from crowdmap_torch.plausibility.lever import HIDDEN_LEVER
-from crowdmap_torch.plausibility.poses import FRAMES_LEFT_OUT, LEAPS_TAKEN_OUT
+from crowdmap_torch.plausibility.poses import ONE_HEIGHT
+from crowdmap_torch.plausibility.put_right import FRAMES_LEFT_OUT, LEAPS_TAKEN_OUT
 from crowdmap_torch.plausibility.units import raw_findings, read_raw_poses
 from crowdmap_torch.tables import Dataset
 
 STOPS, SPOILS, NOTE = "stops", "spoils", "note"
 """How grave: a journey or the data set is refused; the map will be wrong; worth knowing."""
-_NOTES = ("sigmas", FRAMES_LEFT_OUT, LEAPS_TAKEN_OUT, HIDDEN_LEVER)
+_NOTES = ("sigmas", ONE_HEIGHT, FRAMES_LEFT_OUT, LEAPS_TAKEN_OUT, HIDDEN_LEVER)
 """Findings that cost a map little."""
 _ROWS = 5
 """Rows that a line names."""

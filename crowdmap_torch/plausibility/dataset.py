@@ -33,13 +33,8 @@ from crowdmap_torch.plausibility.lever import (
     lever_of,
     said_of_lever,
 )
-from crowdmap_torch.plausibility.poses import (
-    FRAMES_LEFT_OUT,
-    LEAPS_TAKEN_OUT,
-    axes_alike,
-    in_kilometres,
-    pose_findings,
-)
+from crowdmap_torch.plausibility.poses import ONE_HEIGHT, axes_alike, in_kilometres, pose_findings
+from crowdmap_torch.plausibility.put_right import FRAMES_LEFT_OUT, LEAPS_TAKEN_OUT
 from crowdmap_torch.plausibility.rig import rig_findings
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.processes.workers import Call
@@ -171,6 +166,7 @@ _HARMLESS = (
     "road-normal",
     "camera-height",
     "leap",
+    ONE_HEIGHT,
     FRAMES_LEFT_OUT,
     LEAPS_TAKEN_OUT,
 )

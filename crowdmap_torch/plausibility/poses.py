@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.io.detections import FROZEN
 from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.plausibility.finding import Finding, Repair
+from crowdmap_torch.plausibility.put_right import put_right_findings
 from crowdmap_torch.plausibility.units import UnitLimits, unit_findings, usual_speed
 from crowdmap_torch.processes.sums import running_sum
 from crowdmap_torch.tables import Journey, Origin
@@ -46,6 +46,8 @@ class PoseLimits:
     """Distance from the origin: the tangent plane is a kilometre over the ground there."""
     high_m: float = 2_000.0
     """Height over the origin, in either direction."""
+    flat_m: float = 150.0
+    """Over so much of a road its height changes."""
     sigma_m: tuple[float, float] = (1e-3, 100.0)
     """Median sigma of positions."""
     sigma_rad: tuple[float, float] = (1e-6, 0.5)
@@ -61,10 +63,10 @@ _AXES = {
     "x ahead, y left, z up": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
     "x ahead, y right, z down": ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
 }
-LEAPS_TAKEN_OUT = "leaps-taken-out"
-"""Kind of the finding that tells of leaps that a map does without."""
-FRAMES_LEFT_OUT = "frozen-poses"
-"""Kind of the finding that tells of frames whose detections a map does without."""
+ONE_HEIGHT = "one-height"
+"""Kind of the finding that tells of heights that nobody measured."""
+_SAME_HEIGHT_M = 1e-6
+"""Heights that went through a mount and back differ by less."""
 _UPRIGHT = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 """The same of a camera as OpenGL has it: x right, y up, z back."""
 _DEGREE_M = 111e3
@@ -85,8 +87,7 @@ def pose_findings(
     return [
         *_heights(journey, origin, limits),
         *_speeds(journey, limits),
-        *_freezes(journey),
-        *_leaps(journey),
+        *put_right_findings(journey),
         *_sigmas(journey, limits),
         *_rounded(journey, limits),
         *_axes(journey, limits),
@@ -176,6 +177,15 @@ def _heights(journey: Journey, origin: Origin, limits: PoseLimits) -> Iterator[F
             "z or the origin's height_m is in another unit or datum",
             "write metres over dataset.json's origin",
         )
+    p = _links(journey)[:, :3, 3]
+    extent = p.amax(0) - p.amin(0)
+    if float(extent[:2].norm()) > limits.flat_m and float(extent[2]) < _SAME_HEIGHT_M:
+        yield Finding(
+            ONE_HEIGHT,
+            f"z is {float(p[0, 2]):.2f} m in every frame, over {float(extent[:2].norm()):.0f} m of road",
+            "positions are of two dimensions",
+            "write heights: signs and lanes are mapped on a level plane otherwise, and rise and fall with no road",
+        )
 
 
 def _speeds(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
@@ -200,28 +210,6 @@ def _speeds(journey: Journey, limits: PoseLimits) -> Iterator[Finding]:
             f"{float(seconds[first]):.2f} s",
             "positioning lost its way, or two drives stand in one file",
             "cut the journey there",
-        )
-
-
-def _freezes(journey: Journey) -> Iterator[Finding]:
-    left = sum(count for reason, count in journey.dropped.items() if reason.endswith(FROZEN))
-    if left:
-        yield Finding(
-            FRAMES_LEFT_OUT,
-            f"positions stay where they are while the car drives on, and {left} detections are in such frames",
-            "positioning was lost for a moment",
-            "nothing: these detections are left out",
-        )
-
-
-def _leaps(journey: Journey) -> Iterator[Finding]:
-    if journey.leaps_m:
-        times = "once" if len(journey.leaps_m) == 1 else f"{len(journey.leaps_m)} times"
-        yield Finding(
-            LEAPS_TAKEN_OUT,
-            f"positions leap {times} between two frames, by {max(journey.leaps_m):.1f} m at most",
-            "positioning changed its mind, by other satellites or behind a bridge",
-            "nothing: the drive is put together again where it leaps",
         )
 
 

@@ -72,9 +72,27 @@ def test_a_leap_is_named_with_its_frames() -> None:
     journey = drive(torch.zeros(60).double())
     T = journey.T_world_camera.clone()
     T[30:, 0, 3] += 400
+    T[30:, 2, 3] += 0.1
     (found,) = pose_findings(replace(journey, T_world_camera=T), ORIGIN)
     assert found.kind == "leap"
     assert "frames 29 and 30" in found.evidence
+
+
+@pytest.mark.parametrize("mounted", [False, True])
+def test_one_height_in_all_frames_is_named_where_the_road_is_long(mounted: bool) -> None:
+    journey = drive(torch.zeros(400).double())
+    if mounted:
+        T_link_camera = journey.rig.T_link_camera.clone()
+        T_link_camera[:3, 3] = torch.tensor([0.7, -0.2, 1.9])
+        rig = replace(journey.rig, T_link_camera=T_link_camera)
+        journey = replace(journey, rig=rig, T_world_camera=journey.T_world_camera @ T_link_camera)
+    (found,) = pose_findings(journey, ORIGIN)
+    assert (found.kind, found.repair) == ("one-height", None)
+    T = journey.T_world_camera.clone()
+    T[:, 2, 3] += torch.linspace(0, 0.01, 400).double()
+    assert pose_findings(replace(journey, T_world_camera=T), ORIGIN) == []
+    short = journey.with_frames(torch.arange(100))
+    assert pose_findings(short, ORIGIN) == []
 
 
 def test_leaps_that_a_map_does_without_are_told() -> None:
