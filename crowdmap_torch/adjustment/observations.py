@@ -13,6 +13,7 @@ from torch import Tensor
 from crowdmap_torch.adjustment.lenses import SeenPoints, lenses_of, seen_points
 from crowdmap_torch.geometry import camera, polygon
 from crowdmap_torch.geometry.trajectory import station
+from crowdmap_torch.noise.pixels import longer_side
 from crowdmap_torch.road.ground_projection import ground_points_camera
 from crowdmap_torch.tables import Association, Journey, RoadEstimate, Signs, concatenate
 
@@ -106,7 +107,7 @@ def _corners(
         corners[used].gather(1, at) for corners in (detections.corners_px, detections.corners_ideal)
     )
     # Slots past the shape's number of corners repeat one of them.
-    box = (px.amax(1) - px.amin(1)).amax(-1)
+    box = longer_side(px)
     mask, template = polygon.corner_mask(shape), polygon.template(shape)
     row, corner = torch.nonzero(mask, as_tuple=True)
     boxed = polygon.is_box(px, shape) & (box_sigma > 0)

@@ -19,6 +19,7 @@ _LAST = 1.5
 _LEAST_SHARE = 0.1
 """Share of the moving frames that have to be held: a car that crawls by rounded positions has fewer."""
 _LEAST_LEAPS = 5
+"""Fewer tell nothing."""
 
 
 def held_frames(

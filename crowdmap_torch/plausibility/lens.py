@@ -22,7 +22,7 @@ from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.camera import Camera, distort, unproject
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.geometry.triangulation import midpoint_ragged
-from crowdmap_torch.noise.pixels import PixelNoiseConfig, detection_noise
+from crowdmap_torch.noise.pixels import PixelNoiseConfig, detection_noise, longer_side
 from crowdmap_torch.noise.positioning import (
     DriftPathConfig,
     PositioningNoise,
@@ -379,7 +379,7 @@ def _whitening(
     by_pose[:, 0::2, 0], by_pose[:, 1::2, 1] = 1.0, 1.0
     # By the size that all views of a sign expect of each: an outline that came out large by chance would weigh more.
     pixels = PixelNoiseConfig()
-    box = (seen.px.amax(1) - seen.px.amin(1)).amax(-1)
+    box = longer_side(seen.px)
     expected = group_median(box * away, views.sign, signs)[views.sign] / away
     small = pixels.small_box_px
     factor = ((1 + (small / expected).square()) / (1 + (small / box).square())).sqrt()
