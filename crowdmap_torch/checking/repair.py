@@ -13,6 +13,7 @@ from crowdmap_torch.checking.check import Check, Item, check_dataset
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.io.atomic import atomic_folder
 from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.remote import Place
 from crowdmap_torch.plausibility.finding import Repair
 
 _MOST_ROUNDS = 6
@@ -62,11 +63,13 @@ def _wanted(check: Check) -> list[tuple[Item, str, Repair]]:
     return [one for one in every if one[2].name != "heights" or one[1] not in turned]
 
 
-def refuse_place(folder: Path, new: Path) -> None:
+def refuse_place(dataset: Place, new: Path) -> None:
     """InputError if nothing may be written to `new`."""
-    here, there = Path(os.path.realpath(folder)), Path(os.path.realpath(new))
-    if there.is_relative_to(here) or here.is_relative_to(there):
-        raise InputError(f"{new}: inside {folder}, or around it; choose another folder for --fix")
+    if isinstance(dataset, Path):
+        here, there = Path(os.path.realpath(dataset)), Path(os.path.realpath(new))
+        if there.is_relative_to(here) or here.is_relative_to(there):
+            rule = f"inside {dataset}, or around it; choose another folder for --fix"
+            raise InputError(f"{new}: {rule}")
     if os.path.lexists(new):
         raise InputError(f"{new}: exists; expected the name of a new folder for --fix")
 

@@ -16,8 +16,10 @@ from pathlib import Path
 from crowdmap_torch.checking.check import NOTE, SPOILS, STOPS, Check, Item, check_dataset
 from crowdmap_torch.checking.repair import refuse_place, write_repaired
 from crowdmap_torch.config import load_config
+from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.documents import write_json
 from crowdmap_torch.io.errors import InputError, input_read
+from crowdmap_torch.io.remote import Place, at_hand, place_of
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.report.check import write_check_page
 from crowdmap_torch.report.check_json import check_content
@@ -33,7 +35,9 @@ _TOLD = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap check` takes."""
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="a folder as in FORMAT.md")
+    parser.add_argument(
+        "dataset", type=place_of, metavar="DATASET", help="a folder as in FORMAT.md or a URL"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the findings here too")
     parser.add_argument(
         "--html", type=Path, metavar="FILE", help="write a page with findings and pictures here"
@@ -49,14 +53,14 @@ def run(options: argparse.Namespace) -> int:
     with input_read():
         _refuse_places(options)
         config = load_config(options.config)
-        with one_core_each():
-            check = check_dataset(options.dataset, config)
+        with one_core_each(), reading(config.reading), at_hand(options.dataset) as here:
+            check = check_dataset(here, config)
             _show(options.dataset, check)
             mended = None
             if options.fix is not None and any(item.repairs for item in check.items):
-                mended = write_repaired(options.dataset, options.fix, check, config)
+                mended = write_repaired(here, options.fix, check, config)
             if options.html is not None:
-                write_check_page(options.html, options.dataset, check, config)
+                write_check_page(options.html, here, check, config)
                 print(f"page: {options.html}")
     if options.json is not None:
         write_json(options.json, check_content(options.dataset, check, options.fix, mended))
@@ -84,20 +88,21 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _refuse_places(options: argparse.Namespace) -> None:
+    place = options.dataset
     if options.fix is not None:
-        refuse_place(options.dataset, options.fix)
+        refuse_place(place, options.fix)
     for out in (options.json, options.html):
         if out is None:
             continue
         if out.is_dir():
             raise InputError(f"{out}: a folder; expected the name of a file")
-        if out.resolve().is_relative_to(options.dataset.resolve()):
-            raise InputError(f"{out}: inside {options.dataset}; choose a place outside it")
+        if isinstance(place, Path) and out.resolve().is_relative_to(place.resolve()):
+            raise InputError(f"{out}: inside {place}; choose a place outside it")
 
 
-def _show(folder: Path, check: Check) -> None:
+def _show(place: Place, check: Check) -> None:
     used = len(check.dataset.journeys) if check.dataset is not None else 0
-    print(f"{folder}: {used} journeys can be used, {len(check.unseen)} have files that are refused")
+    print(f"{place}: {used} journeys can be used, {len(check.unseen)} have files that are refused")
     if not check.items:
         print("nothing found")
     for severity, told in _TOLD.items():

@@ -43,6 +43,7 @@ from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.errors import InputError, input_read, one_line
 from crowdmap_torch.io.maps import certain_part
+from crowdmap_torch.io.remote import place_of
 from crowdmap_torch.io.tiled_maps import DEFAULT_LEVEL, TileLevel
 from crowdmap_torch.io.truth import Truth
 from crowdmap_torch.noise.calibration import KnownCalibration
@@ -85,7 +86,11 @@ EMPTY_MAP = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap optimize` takes."""
     parser.add_argument(
-        "dataset", type=Path, nargs="?", metavar="DATASET", help="a folder as in FORMAT.md"
+        "dataset",
+        type=place_of,
+        nargs="?",
+        metavar="DATASET",
+        help="a folder as in FORMAT.md or a URL",
     )
     parser.add_argument("--out", type=Path, metavar="RUN", help="folder to write")
     parser.add_argument("--config", type=Path, metavar="YAML", help="what differs from defaults")
@@ -178,6 +183,8 @@ def run(options: argparse.Namespace) -> int:
     with keeping(folder.kept), folder.claimed(), one_core_each(), where:
         if not options.resume:
             where.begin_early(options.dataset)
+        with reading(config.reading):
+            where.bring(options.dataset, _wanted(options))
         return _map(options, folder, config, where)
 
 
@@ -185,7 +192,7 @@ def _map(
     options: argparse.Namespace, folder: RunFolder, config: MapperConfig, where: Whereabouts
 ) -> int:
     with input_read():
-        device, given = where.device, _read(options, config, where.of_journeys)
+        device, given = where.device, _read(options, config, where)
         dataset, survey, truth = given.dataset, given.survey, given.truth
         inputs = inputs_of(dataset, config, survey, truth, given.control, given.cars, device=device)
         kept = Checkpoint(folder.checkpoint, inputs)
@@ -343,12 +350,13 @@ class _Given:
         return {"control": pins, "known_cars": self.cars}
 
 
-def _read(options: argparse.Namespace, config: MapperConfig, device: torch.device) -> _Given:
+def _read(options: argparse.Namespace, config: MapperConfig, where: Whereabouts) -> _Given:
     """What there is to map from, and to judge the map by."""
-    with reading(config.reading, inside=options.dataset):
-        dataset = _load(options, device)
-        survey = read_survey_of(options.dataset, dataset.origin)
-        truth, cut = read_truth_of(options.dataset, dataset, survey), None
+    folder = where.at_hand
+    with reading(config.reading, inside=folder):
+        dataset = _load(options, folder, where.of_journeys)
+        survey = read_survey_of(folder, dataset.origin)
+        truth, cut = read_truth_of(folder, dataset, survey), None
     if options.bbox is not None:
         dataset, cut = cut_dataset(dataset, options.bbox)
         truth = truth and cut_truth(truth, options.bbox)
@@ -364,13 +372,15 @@ def _read(options: argparse.Namespace, config: MapperConfig, device: torch.devic
     return _Given(dataset, survey, truth, control, cars, cut)
 
 
-def _load(options: argparse.Namespace, device: torch.device) -> Dataset:
+def _wanted(options: argparse.Namespace) -> list[str] | None:
+    return None if options.journeys is None else options.journeys.split(",")
+
+
+def _load(options: argparse.Namespace, folder: Path, device: torch.device) -> Dataset:
     """The dataset; every journey that is set aside is named, also where none is left."""
-    wanted = None if options.journeys is None else options.journeys.split(",")
+    wanted = _wanted(options)
     try:
-        dataset = load_dataset(
-            options.dataset, device=device, strict=options.strict, journeys=wanted
-        )
+        dataset = load_dataset(folder, device=device, strict=options.strict, journeys=wanted)
     except NoJourneyLeft as error:
         _tell_rejected(error.rejected)
         raise
@@ -422,8 +432,9 @@ def _compared(
 
 def _facts(options: argparse.Namespace, cut: Cut | None) -> dict[str, str]:
     """What a report says at its head of what was mapped, when and with what."""
+    place = options.dataset
     facts = {
-        "data set": str(options.dataset.resolve()),
+        "data set": str(place.resolve() if isinstance(place, Path) else place),
         "mapped": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "with": f"crowdmap {__version__}",
     }

@@ -17,6 +17,7 @@ from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.engine import Engine, Spent
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.errors import input_read, needing
+from crowdmap_torch.io.remote import Place, at_hand
 from crowdmap_torch.io.stored_drives import StoredDrive, stored_drives
 from crowdmap_torch.plausibility.dataset import Look, look_over
 from crowdmap_torch.processes.threads import repeatable
@@ -49,6 +50,8 @@ class Whereabouts(ExitStack):
         """Where journeys are read and mapped: by other processes on CPUs, which are faster at it than a GPU."""
         self.at_work: Engine | None = None
         """The engine, where there is work for it."""
+        self.at_hand = Path()
+        """The folder of the data set that was brought."""
         self.stored: tuple[StoredDrive, ...] | None = None
         """Where workers find the journeys; None: they are handed over."""
         self._starting = 0
@@ -59,7 +62,7 @@ class Whereabouts(ExitStack):
             with input_read():
                 self.at_work = self.enter_context(self.engine)
 
-    def begin_early(self, folder: Path) -> None:
+    def begin_early(self, place: Place) -> None:
         """Begins workers beside this process for the journeys of a data set that is yet to be read.
 
         They import what they need, which takes seconds, while it is read.
@@ -68,11 +71,17 @@ class Whereabouts(ExitStack):
             return
         self.begin(is_needed=True)
         with suppress(OSError):
-            journeys = sum(1 for _ in (folder / "journeys").iterdir())
-            for number in range(min(self.engine.free, journeys)):
+            most = self.engine.free
+            if isinstance(place, Path):
+                most = min(most, sum(1 for _ in (place / "journeys").iterdir()))
+            for number in range(most):
                 # To come to it, a worker imports all that mapping a journey takes.
                 self.engine.submit(number, ("the start of a worker", mapper.silent, ()))
                 self._starting += 1
+
+    def bring(self, place: Place, journeys: Sequence[str] | None) -> None:
+        """Has those journeys of a data set at hand: where they are or, until all are mapped, in a copy."""
+        self.at_hand = self.enter_context(at_hand(place, journeys))
 
     def _await_workers(self) -> None:
         """Waits for the workers that were begun early."""
@@ -84,17 +93,19 @@ class Whereabouts(ExitStack):
                 self._starting -= 1
 
     def looked_over(
-        self, folder: Path, dataset: Dataset, config: MapperConfig, digests: Mapping[str, str]
+        self, place: Place, dataset: Dataset, config: MapperConfig, digests: Mapping[str, str]
     ) -> Look:
-        """What looks wrong with the data set, by the workers; `digests` are those of the journeys, by id."""
+        """What looks wrong with the data set at hand, by the workers; `digests` are those of the journeys, by id."""
         if self.engine.name == "ray":
             # Workers may be elsewhere. Those beside this process would take longer to read a journey than to be handed it.
-            self.stored = stored_drives(folder, dataset, digests, config.reading)
+            self.stored = stored_drives(place, dataset, digests, config.reading)
         self._await_workers()
         noise, association = config.positioning, config.sign_association
         with reading(config.reading):
             look = look_over(
-                *(folder, dataset, noise, association), engine=self.at_work, stored=self.stored
+                *(self.at_hand, dataset, noise, association),
+                engine=self.at_work,
+                stored=self.stored,
             )
         # What metrics.json says that workers took is mapping's.
         self.engine.spent = Spent()

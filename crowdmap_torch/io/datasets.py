@@ -24,6 +24,7 @@ from crowdmap_torch.io.detections import (
 from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.poses import read_poses
+from crowdmap_torch.io.remote import Url, at_hand, place_of
 from crowdmap_torch.io.rigs import read_rig
 from crowdmap_torch.noise.freezes import driven_on, frozen_frames
 from crowdmap_torch.noise.leaps import without_leaps
@@ -48,11 +49,15 @@ def load_dataset(
 ) -> Dataset:
     """The journeys of a dataset, in the order of their names, and those set aside with the reason.
 
-    `journeys`: only those with these ids, or that match these patterns (`2026-05-*`); None: all. A drive counts once:
-    copies of a journey are set aside, and what was cut out of it. InputError if the dataset itself breaks FORMAT.md, if
-    an id or pattern is that of no journey, if none is left (`NoJourneyLeft`), or, `strict`, if a single one is set aside.
+    `path` may be a URL: what is read is copied first (`io.remote`). `journeys`: only those with these ids, or that match
+    these patterns (`2026-05-*`); None: all. A drive counts once: copies of a journey are set aside, and what was cut out of
+    it. InputError if the dataset itself breaks FORMAT.md, if an id or pattern is that of no journey, if none is left
+    (`NoJourneyLeft`), or, `strict`, if a single one is set aside.
     """
-    folder = Path(path)
+    folder = place_of(path)
+    if isinstance(folder, Url):
+        with at_hand(folder, journeys, survey=False) as copy:
+            return load_dataset(copy, device=device, strict=strict, journeys=journeys)
     if not folder.is_dir():
         raise InputError(f"{folder}: the dataset's folder is missing; expected dataset.json in it")
     with reading(inside=folder):

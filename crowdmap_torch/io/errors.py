@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
 from typing import Literal
 
 Code = Literal[
@@ -48,8 +50,23 @@ class InputError(ValueError):
     """Input that breaks FORMAT.md; one line: where, what was expected, what found, what to do."""
 
     def __init__(self, text: str = "", code: Code = "other") -> None:
+        for folder, name in _CALLED.get():
+            text = text.replace(folder, name)
         super().__init__(text)
         self.code: Code = code
+
+
+_CALLED: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("called", default=())
+
+
+@contextmanager
+def calling(folder: Path, name: str) -> Iterator[None]:
+    """Inside, errors call a folder that is a copy by the name of what it was copied from."""
+    token = _CALLED.set((*_CALLED.get(), (str(folder), name)))
+    try:
+        yield
+    finally:
+        _CALLED.reset(token)
 
 
 def one_line(error: object) -> str:

@@ -11,6 +11,7 @@ from crowdmap_torch.io.area import Area, cut_journey
 from crowdmap_torch.io.budget import ReadingBudget, reading
 from crowdmap_torch.io.datasets import load_journey, recoded
 from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.remote import Place, at_hand
 from crowdmap_torch.io.trees import digest
 from crowdmap_torch.tables import Dataset, Journey
 
@@ -19,8 +20,8 @@ from crowdmap_torch.tables import Dataset, Journey
 class StoredDrive:
     """One drive of a dataset, as it was read and cut where the work was handed out."""
 
-    dataset: Path
-    """Its folder, from the root: workers may be elsewhere."""
+    dataset: Place
+    """Its folder, from the root, or its URL: workers may be elsewhere."""
     journey_id: str
     type_names: tuple[str, ...]
     """What the `type` column of signs counts."""
@@ -32,14 +33,17 @@ class StoredDrive:
 
     def read(self) -> Journey:
         """The drive; InputError if it is not what it was, or not to be found here."""
-        folder = self.dataset / "journeys" / self.journey_id
+        with reading(self.budget), at_hand(self.dataset, [self.journey_id], survey=False) as here:
+            return self._read(here)
+
+    def _read(self, dataset: Path) -> Journey:
+        folder = dataset / "journeys" / self.journey_id
         if not folder.is_dir():
             raise InputError(
                 f"{folder}: is not there on {platform.node()}; workers read their drives themselves, every machine "
                 "needs the dataset at the same place"
             )
-        with reading(self.budget):
-            journey, own = load_journey(folder)
+        journey, own = load_journey(folder)
         journey = recoded(journey, own, self.type_names)
         if self.bbox is not None:
             journey = cut_journey(journey, Area(*self.bbox))
@@ -51,12 +55,12 @@ class StoredDrive:
 
 
 def stored_drives(
-    folder: Path, dataset: Dataset, digests: Mapping[str, str], budget: ReadingBudget
+    place: Place, dataset: Dataset, digests: Mapping[str, str], budget: ReadingBudget
 ) -> tuple[StoredDrive, ...]:
-    """The drives of a dataset that was read from a folder within a budget; `digests` are those of the journeys, by id."""
+    """The drives of a dataset that was read from a place within a budget; `digests` are those of the journeys, by id."""
     return tuple(
         StoredDrive(
-            dataset=folder.absolute(),
+            dataset=place.absolute() if isinstance(place, Path) else place,
             journey_id=journey.journey_id,
             type_names=dataset.type_names,
             bbox=dataset.bbox,

@@ -7,16 +7,17 @@ from typing import Any
 
 from crowdmap_torch.checking.check import Check, Item
 from crowdmap_torch.checking.repair import Mended
+from crowdmap_torch.io.remote import Place
 
 
 def check_content(
-    folder: Path, check: Check, new: Path | None, mended: Mended | None
+    place: Place, check: Check, new: Path | None, mended: Mended | None
 ) -> dict[str, Any]:
     """The findings of a data set, and of what `--fix` made of it."""
     content: dict[str, Any] = {
         "format": "crowdmap-check",
         "version": 1,
-        "dataset": str(folder),
+        "dataset": str(place),
         "is_sound": check.is_sound,
         "journeys": [j.journey_id for j in check.dataset.journeys] if check.dataset else [],
         "refused_journeys": list(check.unseen),

@@ -21,6 +21,7 @@ from crowdmap_torch.io.documents import plain, read_json, write_json
 from crowdmap_torch.io.errors import InputError
 from crowdmap_torch.io.landmarks import write_lanes, write_signs
 from crowdmap_torch.io.maps import write_map
+from crowdmap_torch.io.remote import Place
 from crowdmap_torch.io.runs import write_associations, write_refined_poses, write_road_estimate
 from crowdmap_torch.io.sign_outcomes import NamedOutcomes, write_sign_outcomes
 from crowdmap_torch.io.surveys import read_survey
@@ -108,7 +109,7 @@ class RunFolder:
                 with suppress(OSError):
                     folder.rmdir()
 
-    def prepare(self, dataset: Path | None = None) -> None:
+    def prepare(self, dataset: Place | None = None) -> None:
         """Begins a run of a data set, whose place is kept; without `resume` what an interrupted one has left goes."""
         self._is_begun = True
         place = {} if dataset is None else {"dataset": _way(self.path, dataset)}
@@ -308,8 +309,10 @@ class RunFolder:
             write_lanes(place / "lanes.parquet", made.lanes, lanes)
 
 
-def _way(run: Path, dataset: Path) -> str:
-    """The data set as seen from the run, so that both can be moved together."""
+def _way(run: Path, dataset: Place) -> str:
+    """The data set as seen from the run, so that both can be moved together; a URL without its keys."""
+    if not isinstance(dataset, Path):
+        return str(dataset)
     return os.path.relpath(dataset.resolve(), run.resolve())
 
 
@@ -322,8 +325,10 @@ def _is_run(path: Path) -> bool:
         return (path / "metrics.json").is_file() and (path / "map" / "map.json").is_file()
 
 
-def refuse_overlap(run: Path, dataset: Path) -> None:
+def refuse_overlap(run: Path, dataset: Place) -> None:
     """ValueError if a run would write into the dataset that it reads, or around it, links followed."""
+    if not isinstance(dataset, Path):
+        return
     out, source = run.resolve(), dataset.resolve()
     if out == source or out in source.parents or source in out.parents:
         raise ValueError(

@@ -21,6 +21,7 @@ from crowdmap_torch.fleet.engine import ATTEMPTS, Engine
 from crowdmap_torch.io.budget import ReadingBudget
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.errors import InputError
+from crowdmap_torch.io.remote import place_of
 from crowdmap_torch.io.stored_drives import StoredDrive, stored_drives
 from crowdmap_torch.io.trees import digest
 from crowdmap_torch.mapper import map_journeys
@@ -102,6 +103,18 @@ def test_workers_that_read_drives_themselves_give_the_same_bits_and_so_does_a_se
     assert engine.spent.again == killed == len(caplog.messages) == len(list(tmp_path.iterdir()))
     assert all("journey-001" in said and "done again" in said for said in caplog.messages)
     assert engine.spent.tasks == 3 and engine.spent.seconds > 0
+
+
+@pytest.mark.parametrize("name", ["processes", pytest.param("ray", marks=needs_ray)])
+def test_workers_read_drives_by_url(
+    begin: Begin, folder: Path, dataset: Dataset, made: str, name: str
+):
+    digests = {journey.journey_id: digest(journey) for journey in dataset.journeys}
+    place = place_of(f"local://{folder}")
+    drives = stored_drives(place, dataset, digests, ReadingBudget())
+    assert (
+        digest(map_journeys(dataset.journeys, CONFIG, engine=begin(name, 2), stored=drives)) == made
+    )
 
 
 @pytest.mark.parametrize("stated", [False, True])
