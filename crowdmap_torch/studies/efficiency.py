@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from statistics import fmean
@@ -14,6 +14,7 @@ from crowdmap_torch.evaluation.visibility import observable_signs
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.io.maps import read_map
 from crowdmap_torch.simulate.dataset import SimulationConfig
+from crowdmap_torch.simulate.errors import ERRORS, with_errors
 from crowdmap_torch.studies.chapter import Cell, Chapter, Table
 from crowdmap_torch.studies.curves import Line, Panel, plot_lines
 from crowdmap_torch.studies.fleet import RIGHT, Variant
@@ -30,6 +31,14 @@ ASKED = {"relative": 1.2, "absolute": 1.1}
 """Most that our corner error may be, in multiples of the linear estimator's."""
 TREMBLES = (RIGHT, Variant("jitter"), Variant("jitter", 2.0))
 """Detectors whose outlines stand still, tremble, and tremble twice as much."""
+_OF_POSES = ("sigmas", "outages")
+_OF_CARS = tuple(name for name in ERRORS if name not in ("jitter", *_OF_POSES))
+FLEETS: Mapping[str, tuple[str, ...]] = {
+    "none": (),
+    "of cars and detectors": _OF_CARS,
+    "these, and outlines tremble": (*_OF_CARS, "jitter"),
+}
+"""Errors of real fleets, but for those of what is stated of poses: the linear estimator knows how far these are off."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +67,8 @@ class MeasureLinear(Task):
         drives = load_drives(dataset)
         begun = time.process_time()
         true_signs = read_map(dataset / "survey").signs
-        found = linear_map(drives.truth, drives.survey, true_signs, self.simulation)
+        told = drives.truth, drives.survey, true_signs, self.simulation
+        found = linear_map(*told, drives.vehicles)
         observable = observable_signs(drives.truth, drives.survey.signs)
         signs = found.signs[observable[found.row]]
         own = (signs.covariance - found.shared).diagonal(dim1=1, dim2=2).sum(1)
@@ -74,7 +84,9 @@ class MeasureLinear(Task):
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """Both estimates for each seed."""
     scale = settings.scale
-    for pair in chain(_pairs(scale), *(_trembling(scale, variant) for variant in TREMBLES)):
+    trembling = (_few(scale, variant.spoil) for variant in TREMBLES)
+    fleets = (_few(scale, _wrong(names)) for names in FLEETS.values())
+    for pair in chain(_pairs(scale), *trembling, *fleets):
         for task in pair:
             yield SHORT_TURNS + 2 * task.simulation.seed, task
 
@@ -108,7 +120,8 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
             "covariance is the Cramer-Rao bound.",
             f"{scale.fleet_journeys} drives over {scale.fleet_road.length_m:.0f} m whose detectors tremble, all corners "
             "of an outline alike and for some time (`study fleet`): the linear estimator weighs them by the covariance that "
-            "they are drawn from.",
+            "they are drawn from. And the same drives with all that real cars and detectors have wrong: it knows how large "
+            "each of these errors is in the mean, and has to find them.",
         ),
         tables=(
             Table(
@@ -123,7 +136,15 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
                     *("trembles by [px]", "ours, relative [m]", "/ standing still"),
                     *("linear estimator [m]", "/ standing still", "ours / linear", "seeds"),
                 ),
-                _tremble_rows(scale, folder),
+                _rows(folder, _tremble_pairs(scale)),
+            ),
+            Table(
+                "efficiency-fleet",
+                (
+                    *("errors", "ours, relative [m]", "/ none"),
+                    *("linear estimator [m]", "/ none", "ours / linear", "seeds"),
+                ),
+                _rows(folder, _fleet_pairs(scale)),
             ),
         ),
         plots={"efficiency": plot_lines(panels, x="seed", y="mean corner error [m]")},
@@ -137,11 +158,31 @@ def _pairs(scale: Scale) -> _Pairs:
     return [(m, MeasureLinear(m.simulation)) for m in honest_maps(scale, scale.linear_sets)]
 
 
-def _trembling(scale: Scale, variant: Variant) -> _Pairs:
-    """A few drives with these detectors, seed by seed."""
-    drives = [variant.spoil(scale.fleet_drives(seed)) for seed in range(scale.fleet_seeds)]
+_Spoil = Callable[[SimulationConfig], SimulationConfig]
+
+
+def _few(scale: Scale, spoil: _Spoil) -> _Pairs:
+    """A few drives that are spoilt so, seed by seed."""
+    drives = [spoil(scale.fleet_drives(seed)) for seed in range(scale.fleet_seeds)]
     count = scale.fleet_journeys
     return [(MeasureMap(each, count, config=OURS), MeasureLinear(each)) for each in drives]
+
+
+def _wrong(names: tuple[str, ...]) -> _Spoil:
+    return lambda drives: with_errors(drives, names)
+
+
+def _tremble_pairs(scale: Scale) -> Iterator[tuple[Cell, _Pairs]]:
+    """By how far their outlines tremble."""
+    for variant in TREMBLES:
+        pairs = _few(scale, variant.spoil)
+        yield pairs[0][0].simulation.signs.jitter_px, pairs
+
+
+def _fleet_pairs(scale: Scale) -> Iterator[tuple[Cell, _Pairs]]:
+    """By what is wrong."""
+    for told, names in FLEETS.items():
+        yield told, _few(scale, _wrong(names))
 
 
 def _done(pairs: _Pairs, folder: StudyFolder) -> tuple[list[Result], list[Result]]:
@@ -160,18 +201,21 @@ def _means(ours: list[Result], linear: list[Result], error: str) -> tuple[list[f
     return mine, numbers(linear, f"signs.{error}.total.mean")
 
 
-def _tremble_rows(scale: Scale, folder: StudyFolder) -> tuple[tuple[Cell, ...], ...]:
-    found = []
-    for variant in TREMBLES:
-        pairs = _trembling(scale, variant)
+def _rows(
+    folder: StudyFolder, variants: Iterator[tuple[Cell, _Pairs]]
+) -> tuple[tuple[Cell, ...], ...]:
+    """Errors of both of each variant beside those of the first one."""
+    found: list[tuple[Cell, float, float, int]] = []
+    for told, pairs in variants:
         mine, best = _means(*_done(pairs, folder), "relative")
-        if not mine:
-            # Without those that stand still there is nothing to compare with.
+        if mine:
+            found.append((told, fmean(mine), fmean(best), len(mine)))
+        elif not found:
+            # Without the first there is nothing to compare with.
             break
-        found.append((pairs[0][0].simulation.signs.jitter_px, fmean(mine), fmean(best), len(mine)))
     return tuple(
-        (trembles, mine, mine / found[0][1], best, best / found[0][2], mine / best, seeds)
-        for trembles, mine, best, seeds in found
+        (told, mine, mine / found[0][1], best, best / found[0][2], mine / best, seeds)
+        for told, mine, best, seeds in found
     )
 
 

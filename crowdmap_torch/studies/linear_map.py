@@ -1,15 +1,17 @@
 """The best that can be done, by plain dense algebra: least squares linearised at the truth, and its covariance.
 
 The estimator knows what each detection shows, which ones are outliers, and all noise levels; the poses' error and the
-tremble of detectors are the exact Gaussian processes of the simulation. Its covariance is the Cramer-Rao bound. Nothing here
-is shared with the solver but the residuals: one dense matrix per journey, so it is for roads of a few hundred metres.
+tremble of detectors are the exact Gaussian processes of the simulation. What cars have wrong it has to find (`linear_cars`).
+Its covariance is the Cramer-Rao bound. Nothing here is shared with the solver but the residuals: one dense matrix per
+journey, so it is for roads of a few hundred metres.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -17,6 +19,7 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.evaluation.visibility import observable_signs
 from crowdmap_torch.geometry import camera, polygon, se3, spline_basis
@@ -28,6 +31,7 @@ from crowdmap_torch.optim.robust import Quadratic
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.simulate.positioning import PositioningConfig
 from crowdmap_torch.simulate.sign_detections import SignDetectionConfig
+from crowdmap_torch.studies.linear_cars import calibration_of, prior_of_cars, true_cars
 from crowdmap_torch.tables import Association, ControlPoints, Lanes, RoadEstimate, Signs, Survey
 
 CONTROL_SPACING_M = 8.0
@@ -50,26 +54,37 @@ class LinearMap:
 
 @torch.no_grad()
 def linear_map(
-    truth: Truth, survey: Survey, true_signs: Signs, simulation: SimulationConfig
+    truth: Truth,
+    survey: Survey,
+    true_signs: Signs,
+    simulation: SimulationConfig,
+    vehicles: Mapping[str, Any] | None = None,
 ) -> LinearMap:
     """The estimate from all detections of a simulated dataset, and the Cramer-Rao bound of it.
 
-    `true_signs` are the rows of `survey`.
+    `true_signs` are the rows of `survey`; `vehicles`, the truth of cars, is where the search for what they have wrong
+    begins: None where they have nothing wrong.
     """
     shown = torch.cat([_shown(t) for t in truth.journeys])
     row = torch.unique(shown[shown >= 0])
-    bundle = _bundle_at_truth(truth, survey, true_signs, row)
+    cars = vehicles, calibration_of(simulation.fleet)
+    bundle = _bundle_at_truth(truth, survey, true_signs, row, *cars)
     seen = bundle.corners.sign.unique()
     if len(seen) < len(row):
         # Frames at a standstill are thinned: some signs may have no detection left.
         row = row[seen]
-        bundle = _bundle_at_truth(truth, survey, true_signs, row)
+        bundle = _bundle_at_truth(truth, survey, true_signs, row, *cars)
     signs = true_signs[row]
     # What holds the landmarks where observations do not, as in our adjustment.
     information, force = _normal_equations(
         bundle, list(bundle.fixed.values()), poses=0, first_pose=0
     )
-    information += _held_along(bundle)
+    held, place = _held_along(bundle), _columns(bundle)
+    information[: len(held), : len(held)] += held
+    for name, own, push in prior_of_cars(bundle.values(), bundle.fleet, simulation.fleet):
+        at = slice(place[name], place[name] + len(push))
+        information[at, at] += own
+        force[at] += push
     for number, journey in enumerate(truth.journeys):
         own, push = _of_journey(bundle, truth, number, journey, simulation)
         information += own
@@ -99,9 +114,17 @@ def _shown(truth: JourneyTruth) -> Int[Tensor, " d"]:
 
 
 def _bundle_at_truth(
-    truth: Truth, survey: Survey, true_signs: Signs, row: Int[Tensor, " n"]
+    truth: Truth,
+    survey: Survey,
+    true_signs: Signs,
+    row: Int[Tensor, " n"],
+    vehicles: Mapping[str, Any] | None = None,
+    unknown: CalibrationConfig | None = None,
 ) -> Bundle:
-    """All observations of the signs `row` and of lanes with their true landmarks, started at the truth."""
+    """All observations of the signs `row` and of lanes with their true landmarks, started at the truth.
+
+    So are the cars of the `vehicles`, whose calibrations are `unknown`.
+    """
     of_survey = torch.full((len(true_signs),), -1)
     of_survey[row] = torch.arange(len(row))
     signs = true_signs[row]
@@ -119,8 +142,12 @@ def _bundle_at_truth(
     associations = [_association(t, signs, of_survey) for t in truth.journeys]
     lanes = _true_lanes(survey)
     noise = PositioningNoise()
-    bundle = adjust.build(journeys, roads, signs, lanes, associations, drifts, noise, config)
-    bundle.refresh()
+    told = journeys, roads, signs, lanes, associations, drifts, noise, config
+    bundle = adjust.build(*told, calibration=None if vehicles is None else unknown)
+    bundle.fold(true_cars(bundle.values(), bundle.fleet, vehicles or {}))
+    bundle.relinearise()
+    for _ in range(_REFRESHES):
+        bundle.refresh()
     return bundle
 
 
@@ -172,10 +199,21 @@ def _true_lanes(survey: Survey) -> Lanes:
     )
 
 
+_REFRESHES = 3
+"""Until lane points rest at the splines' nearest places: they begin up to a control point away."""
+_AFTER = "after"
+"""What `_columns` calls the first column behind all."""
+
+
 def _columns(bundle: Bundle) -> dict[str, int]:
-    """First column of each kind of landmark."""
-    n = len(bundle.values()["sign"])
-    return {"sign": 0, "size": 6 * n, "lane": 8 * n}
+    """First column of each kind of landmark, and of what cars have wrong."""
+    values = bundle.values()
+    n = len(values["sign"])
+    found, first = {"sign": 0, "size": 6 * n, "lane": 8 * n}, 8 * n + values["lane"].numel()
+    for name in bundle.fleet.variables:
+        found[name] = first
+        first += values[name].numel()
+    return {**found, _AFTER: first}
 
 
 def _held_along(bundle: Bundle) -> Float[Tensor, "c c"]:
@@ -209,16 +247,24 @@ def _of_journey(
     whole, force = _normal_equations(bundle, [lane], **here)
     own, push = _of_tracks(bundle, corner, t_s, simulation.signs, **here)
     whole, force = whole + own, force + push
-    A, B, C = whole[:p, :p], whole[:p, p:], whole[p:, p:]
-    gx, gy = force[:p], force[p:]
     T = journey.T_world_camera
     way = (T[1:, :3, 3] - T[:-1, :3, 3]).norm(dim=1).cumsum(0)
     way = torch.cat((way.new_zeros(1), way))[frame]
     axes = _pose_covariances(way, simulation.positioning)
     prior = _joint([torch.linalg.inv(axis) for axis in axes])
     error = se3.local(journey.journey.T_world_camera, T)[frame].flatten()
-    right = torch.cat((B, (gx + prior @ error)[:, None]), dim=1)
-    solved = torch.cholesky_solve(right, torch.linalg.cholesky(A + prior))
+    by = error.new_zeros(p, len(whole) - p)
+    if "mount" in bundle.fleet.variables:
+        # What is known of errors is so of what mount and clock leave of them.
+        car, mount = int(bundle.fleet.of_journey[number]), bundle.values()["mount"]
+        moved = bundle.fleet.by_mount(bundle.values()["pose"])[pose].flatten(0, 1)
+        first = _columns(bundle)["mount"] + car * mount.shape[1]
+        by[:, first : first + mount.shape[1]] = -moved
+        error = error - moved @ mount[car]
+    weighed = prior @ by
+    A, B, C = whole[:p, :p] + prior, whole[:p, p:] + weighed, whole[p:, p:] + by.mT @ weighed
+    gx, gy = force[:p] + prior @ error, force[p:] + weighed.mT @ error
+    solved = torch.cholesky_solve(torch.cat((B, gx[:, None]), dim=1), torch.linalg.cholesky(A))
     return C - B.mT @ solved[:, :-1], gy - B.mT @ solved[:, -1]
 
 
@@ -254,7 +300,7 @@ def _normal_equations(
     bundle: Bundle, terms: Sequence[CostTerm], *, poses: int, first_pose: int
 ) -> tuple[Float[Tensor, "c c"], Float[Tensor, " c"]]:
     """Hessian and gradient of some terms at the bundle's values: `poses` from the first one on, then the landmarks."""
-    total = 6 * poses + _columns(bundle)["lane"] + bundle.values()["lane"].numel()
+    total = 6 * poses + _columns(bundle)[_AFTER]
     hessian, gradient = torch.zeros(total, total, dtype=torch.float64), torch.zeros(total).double()
     for term in terms:
         column, J, residual = _linear(bundle, term, poses=poses, first_pose=first_pose)
@@ -297,7 +343,7 @@ def _of_tracks(
     column, J, residual = _linear(bundle, term, poses=poses, first_pose=first_pose)
     sign, t = term.slots[1][1], t_s[term.slots[0][1] - first_pose]
     assert isinstance(term.weight, Tensor)
-    total = 6 * poses + _columns(bundle)["lane"] + bundle.values()["lane"].numel()
+    total = 6 * poses + _columns(bundle)[_AFTER]
     hessian, gradient = torch.zeros(total, total, dtype=torch.float64), torch.zeros(total).double()
     for number in sign.unique():
         own = torch.nonzero(sign == number)[:, 0]

@@ -10,7 +10,7 @@ import numpy as np
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.studies.chapter import Cell, Table
 
-_TRUE = {
+TRUE_NAMES = {
     "mount_deg": "mount_rotation_deg",
     "mount_m": "mount_place_m",
     "clock_s": "clock_s",
@@ -51,7 +51,7 @@ def recovered(uncertainty: MapUncertainty, vehicles: Mapping[str, Any]) -> dict[
             "sigmas": [list(found.sigma[name]) for found in cars.values()],
             "mean_sigma": list(uncertainty.calibration_mean_sigma[name]),
         }
-        for name, true in _TRUE.items()
+        for name, true in TRUE_NAMES.items()
         if name in uncertainty.calibration_mean_sigma
     }
 
@@ -62,7 +62,7 @@ def recovered_table(name: str, maps: Sequence[Mapping[str, Any]], caption: str) 
     What all cars have in common is told apart from what they differ in: of a map it is one number, however many cars.
     """
     found = [one["calibration"] for one in maps if one.get("calibration")]
-    parameters = [key for key in _TRUE if found and key in found[0]]
+    parameters = [key for key in TRUE_NAMES if found and key in found[0]]
     return Table(name, COLUMNS, tuple(_row(key, found) for key in parameters), caption)
 
 
