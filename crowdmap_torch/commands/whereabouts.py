@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -80,7 +81,9 @@ class Whereabouts(ExitStack):
                 self._starting += 1
 
     def bring(self, place: Place, journeys: Sequence[str] | None) -> None:
-        """Has those journeys of a data set at hand: where they are or, until all are mapped, in a copy."""
+        """Has those journeys of a data set at hand: where they are or, until all are mapped, in a copy; copying is told."""
+        if not isinstance(place, Path) and not self._options.quiet:
+            print(f"copying {place}", file=sys.stderr)
         self.at_hand = self.enter_context(at_hand(place, journeys))
 
     def _await_workers(self) -> None:
