@@ -36,7 +36,7 @@ _TOLD = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap check` takes."""
     parser.add_argument(
-        "dataset", type=place_of, metavar="DATASET", help="a folder as in FORMAT.md or a URL"
+        "dataset", type=place_of, metavar="DATASET", help="folder as in FORMAT.md or URL"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the findings here too")
     parser.add_argument(

@@ -86,11 +86,7 @@ EMPTY_MAP = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `crowdmap optimize` takes."""
     parser.add_argument(
-        "dataset",
-        type=place_of,
-        nargs="?",
-        metavar="DATASET",
-        help="a folder as in FORMAT.md or a URL",
+        "dataset", type=place_of, nargs="?", metavar="DATASET", help="folder as in FORMAT.md or URL"
     )
     parser.add_argument("--out", type=Path, metavar="RUN", help="folder to write")
     parser.add_argument("--config", type=Path, metavar="YAML", help="what differs from defaults")

@@ -6,7 +6,6 @@ import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import torch
@@ -24,7 +23,7 @@ from crowdmap_torch.io.detections import (
 from crowdmap_torch.io.documents import Document, read_json
 from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.poses import read_poses
-from crowdmap_torch.io.remote import Url, at_hand, place_of
+from crowdmap_torch.io.remote import Url, at_hand, matching, place_of
 from crowdmap_torch.io.rigs import read_rig
 from crowdmap_torch.noise.freezes import driven_on, frozen_frames
 from crowdmap_torch.noise.leaps import without_leaps
@@ -165,11 +164,10 @@ def journey_folders(folder: Path) -> list[Path]:
 
 def _named(folders: Sequence[Path], wanted: Sequence[str]) -> list[Path]:
     """Those of the journeys' folders that are named, or that a pattern matches."""
-    chosen: set[Path] = set()
+    chosen: set[str] = set()
+    names = [p.name for p in folders]
     for name in wanted:
-        # An id may hold what would be a pattern.
-        own = [p for p in folders if p.name == name]
-        found = own or [p for p in folders if fnmatchcase(p.name, name)]
+        found = matching(names, name)
         if not found:
             known = ", ".join(printable(p.name) for p in folders[:_MOST_NAMED])
             more = len(folders) - _MOST_NAMED
@@ -178,7 +176,7 @@ def _named(folders: Sequence[Path], wanted: Sequence[str]) -> list[Path]:
                 + (f" and {more} more" if more > 0 else "")
             )
         chosen.update(found)
-    return [p for p in folders if p in chosen]
+    return [p for p in folders if p.name in chosen]
 
 
 def refuse_no_journey(folder: Path) -> None:

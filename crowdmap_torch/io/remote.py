@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
@@ -20,9 +21,8 @@ from crowdmap_torch.io.errors import InputError, calling, needing, one_line
 _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://")
 _OF_ARROW = ("abfs", "abfss", "gcs", "gs", "hdfs", "s3", "viewfs")
 """Schemes that pyarrow opens by itself."""
-_TABLE = ".parquet"
-_TEXTS = (".csv", ".json", ".urdf", ".xacro", ".xml", ".yaml", ".yml")
-"""Files that readers of a dataset open: pictures may lie beside them."""
+_TABLE, _TEXT = ".parquet", ".json"
+"""Files that readers open outside of rigs: pictures may lie beside them. In a rig's folder files have any name."""
 _AT_ONCE = 16
 """Files under way at a time: of small ones most of the time is the way there and back."""
 _PIECE = 1 << 20
@@ -85,30 +85,37 @@ def _copy(url: Url, folder: Path, journeys: Sequence[str] | None, survey: bool) 
             f"{url}: the dataset's folder is missing; expected dataset.json in it", "missing-file"
         )
     folder.mkdir()
-    files = [one for one in top if one.type == FileType.File]
-    drives = []
-    for info in source.inside("journeys"):
-        name = info.base_name
-        if info.type != FileType.Directory or name.startswith("."):
-            continue
-        if journeys is None or any(name == one or fnmatchcase(name, one) for one in journeys):
-            drives.append(f"journeys/{name}")
+    drives = {one.base_name: one for one in source.inside("journeys") if _is_journey(one)}
+    for info in drives.values():
         # Of those that are not wanted the names are told where one is asked for that is not there.
         source.place(info, folder).mkdir(parents=True)
+    names = list(drives)
+    if journeys is not None:
+        names = [name for one in journeys for name in matching(names, one)]
+    budget = budget_now()
+
+    def fetch(info: FileInfo) -> None:
+        is_table = PurePosixPath(info.path).suffix == _TABLE
+        source.fetch(info, folder, budget.table_bytes if is_table else budget.text_bytes)
+
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        for found in pool.map(source.inside, drives):
-            files += found
-        for part in ("rigs", "survey") if survey else ("rigs",):
-            files += source.inside(part, recursive=True)
-        budget = budget_now()
-        most = {_TABLE: budget.table_bytes, **dict.fromkeys(_TEXTS, budget.text_bytes)}
-        wanted = [one for one in files if one.type == FileType.File and _kind(one) in most]
-        for _ in pool.map(lambda one: source.fetch(one, folder, most[_kind(one)]), wanted):
+        of_drives = pool.map(source.inside, [f"journeys/{name}" for name in dict.fromkeys(names)])
+        found = [*top, *chain.from_iterable(of_drives)]
+        found += source.inside("survey", recursive=True) if survey else []
+        files = [one for one in found if PurePosixPath(one.path).suffix in (_TABLE, _TEXT)]
+        files += source.inside("rigs", recursive=True)
+        for _ in pool.map(fetch, [one for one in files if one.type == FileType.File]):
             pass
 
 
-def _kind(info: FileInfo) -> str:
-    return PurePosixPath(info.path).suffix.lower()
+def _is_journey(info: FileInfo) -> bool:
+    return info.type == FileType.Directory and not info.base_name.startswith(".")
+
+
+def matching(names: Sequence[str], asked: str) -> list[str]:
+    """Those of some names that are `asked` for, or else that match it as a pattern: an id may hold what would be one."""
+    own = [name for name in names if name == asked]
+    return own or [name for name in names if fnmatchcase(name, asked)]
 
 
 @dataclass(frozen=True)
@@ -172,8 +179,6 @@ class _Source:
         try:
             yield
         except (OSError, ValueError, NotImplementedError) as error:
-            if isinstance(error, InputError):
-                raise
             named = f"{self.url}/{part}".rstrip("/")
             raise InputError(
                 f"{named}: cannot be read ({_told(self.url, error)})", "unreadable"

@@ -75,6 +75,16 @@ def test_an_object_store_is_asked_for_no_more_than_is_read(
     assert fetched == {"journey-001"}
 
 
+def test_a_mount_may_have_any_name(spoilt: Path):
+    rig = next((spoilt / "rigs").glob("*/rig.urdf")).parent
+    text = (rig / "rig.yaml").read_text()
+    assert "urdf: rig.urdf" in text
+    (rig / "rig.yaml").write_text(text.replace("urdf: rig.urdf", "urdf: chains/mount"))
+    (rig / "chains").mkdir()
+    (rig / "rig.urdf").rename(rig / "chains" / "mount")
+    assert digest(load_dataset(url_of(spoilt))) == digest(load_dataset(spoilt))
+
+
 def test_a_copy_has_the_survey_and_goes_when_it_was_read(folder: Path):
     with at_hand(place_of(url_of(folder))) as here:
         assert here.name == "dataset" and here != folder
