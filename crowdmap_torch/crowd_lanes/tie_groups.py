@@ -5,7 +5,8 @@ and between them a metre or more may be left, which is another marker's place. O
 a road's markers can, and where roads turn it tells both axes. A sample of one group, moved by a shift, speaks against it
 where the other drives would have seen it and saw no parallel marker there; what lies farther beside their ways than they
 see says nothing, as whoever drives the other way may see one marker of three. Along a straight road every shift is as
-likely, and the prior decides. What signs tie loosely is placed by both: where markers fit and signs like its own are.
+likely, and the prior decides. A road over another one, further up than biases reach, has nothing to do with it. What signs
+tie loosely is placed by both: where markers fit and signs like its own are.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -57,7 +58,8 @@ class GroupTieConfig(Settings):
     reach: Deviations = 4.0
     """Shifts up to this many of their standard deviations are tried along each axis, or ..."""
     reach_m: Length = 4.0
-    """... up to this, if that is more: how large biases are is known by few drives."""
+    """... up to this, if that is more: how large biases are is known by few drives. What is further up or down is another
+    road."""
     step_m: Spacing = 0.4
     """Between shifts that are tried."""
     least_m: Length = 0.5
@@ -130,14 +132,14 @@ def tie_groups(
             loose = None if others is None else others.of(own, placed)
             if loose is not None:
                 move[own] = loose.followed(move)
-            moved = replace(samples, point=samples.point + move[samples.owner])
-            of_one = _Seen.of(moved[of_sample == one], ways, move, config)
-            of_others = moved[placed[samples.owner]]
-            there = _Seen.of(of_others, ways, move, config, beside=of_one.way)
             of_own, of_placed = (_variance_of_mean(bias_sigma, some) for some in (own, placed))
-            sigma = (of_own + of_placed).sqrt()
-            prior = ShiftPrior(sigma, loose, move)
-            best = _best_shift(of_one, there, prior, drifting)
+            prior = ShiftPrior((of_own + of_placed).sqrt(), loose, move)
+            reach = (config.reach * prior.sigma).clamp_min(config.reach_m)
+            moved = replace(samples, point=samples.point + move[samples.owner])
+            seen = partial(_Seen.of, ways=ways, move=move, level=float(reach[2]), config=config)
+            of_one = seen(moved[of_sample == one])
+            there = seen(moved[placed[samples.owner]], beside=of_one.way)
+            best = _best_shift(of_one, there, prior, reach, drifting)
             if best is None:
                 continue
             shift, ties.rival[one] = best
@@ -166,10 +168,12 @@ class _Seen:
     """What some drives saw, and how far beside their ways."""
 
     line: LineSamples
-    way: Float[Tensor, "w 2"]
-    """Places on their ways."""
+    way: Float[Tensor, "w 3"]
+    """Places on their ways, on the road."""
     beside: float
     """Nearly all that they saw is at most so far beside these [m]."""
+    level: float
+    """What is further up or down is of another road [m]."""
 
     @classmethod
     def of(
@@ -177,34 +181,41 @@ class _Seen:
         line: LineSamples,
         ways: Sequence[Float[Tensor, "_ 4 4"]],
         move: Float[Tensor, "j 3"],
+        level: float,
         config: GroupTieConfig,
         *,
-        beside: Float[Tensor, "w 2"] | None = None,
+        beside: Float[Tensor, "w 3"] | None = None,
     ) -> _Seen:
         """Of drives that are moved, those that saw the most; of what lies `beside` another way, if there is one."""
-        near = line if beside is None else line[_nearest(line.point[:, :2], beside)[0]]
+        near = line if beside is None else line[_nearest(line.point, beside, level)[0]]
         count = torch.bincount(near.owner, minlength=len(move))
         most = torch.argsort(count, descending=True, stable=True)[: config.most_drives]
         drives = most[count[most] > 0].tolist()
         line = line[torch.isin(line.owner, most)]
-        places = [_thinned(ways[n], config.sample_spacing_m) + move[n, :2] for n in drives]
-        way = torch.cat((move.new_zeros(0, 2), *places))
-        i, j = _nearest(line.point[:, :2], way)
-        offset = left_of_axis(line.point[i, :2] - way[j], line.direction[i]).abs()
-        return cls(line, way, float(offset.quantile(_NEARLY_ALL)) if len(offset) else 0.0)
+        places = [_thinned(ways[n], config.sample_spacing_m) + move[n] for n in drives]
+        way = torch.cat((move.new_zeros(0, 3), *places))
+        i, j = _nearest(line.point, way, level)
+        if not len(i):
+            return cls(line, way, 0.0, level)
+        away = line.point[i] - way[j]
+        # Cameras are above the road.
+        way[:, 2] += median_along(away[:, 2], 0)
+        beside_way = left_of_axis(away[:, :2], line.direction[i]).abs()
+        return cls(line, way, float(beside_way.quantile(_NEARLY_ALL)), level)
 
 
-def _thinned(way: Float[Tensor, "f 4 4"], spacing: float) -> Float[Tensor, "k 2"]:
+def _thinned(way: Float[Tensor, "f 4 4"], spacing: float) -> Float[Tensor, "k 3"]:
     """Places along a way, about so far apart."""
     cell = (station(way) / spacing).floor()
-    return way[torch.cat((cell[:1] >= 0, cell[1:] > cell[:-1])), :2, 3]
+    return way[torch.cat((cell[:1] >= 0, cell[1:] > cell[:-1])), :3, 3]
 
 
 def _nearest(
-    place: Float[Tensor, "n 2"], way: Float[Tensor, "w 2"]
+    place: Float[Tensor, "n 3"], way: Float[Tensor, "w 3"], level: float
 ) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
-    """Rows of places that a way passes by, and the row of the nearest place on it."""
-    pairs = cross_pairs(place, way, radius=_FAR_M, count=1)
+    """Rows of places that a way passes by on their level, and the row of the nearest place on it."""
+    squash = place.new_tensor((1.0, 1.0, _FAR_M / level))
+    pairs = cross_pairs(place * squash, way * squash, radius=_FAR_M, count=1)
     return pairs[:, 0], pairs[:, 1]
 
 
@@ -214,13 +225,15 @@ _NEARLY_ALL = 0.95
 
 
 def _best_shift(
-    own: _Seen, others: _Seen, prior: ShiftPrior, config: GroupTieConfig
+    own: _Seen, others: _Seen, prior: ShiftPrior, reach: Float[Tensor, " 3"], config: GroupTieConfig
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]] | None:
-    """The likeliest shift of a group onto others, and from there to a rival, zero where none is; None: nothing is near."""
-    none, sigma = torch.zeros_like(prior.sigma), prior.sigma
-    farthest = (config.reach * sigma[:2]).clamp_min(config.reach_m)
-    steps = (farthest / config.step_m).ceil().long().clamp_min(1)
-    axes = [config.step_m * torch.arange(-int(n), int(n) + 1).to(sigma) for n in steps]
+    """The likeliest shift of a group onto others, and from there to a rival, zero where none is; None: nothing is near.
+
+    Shifts are tried as far as they `reach` along each axis.
+    """
+    none = torch.zeros_like(reach)
+    steps = (reach[:2] / config.step_m).ceil().long().clamp_min(1)
+    axes = [config.step_m * torch.arange(-int(n), int(n) + 1).to(reach) for n in steps]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
     here, there = _Said.of(own, others, grid, config), _Said.of(others, own, -grid, config)
     if here is None or there is None:
@@ -252,18 +265,19 @@ class _Said:
         cls, own: _Seen, others: _Seen, grid: Float[Tensor, "x y 2"], config: GroupTieConfig
     ) -> _Said | None:
         """Of shifts on a grid; None: hardly anything is near."""
-        here, passed = _nearest(own.line.point[:, :2], others.way)
+        here, passed = _nearest(own.line.point, others.way, others.level)
         count = len(here)
         some = torch.linspace(0, count - 1, min(count, config.most_samples)).round().long()
         some = some.to(here)
-        line, way = own.line[here[some]], others.way[passed[some]]
+        line, way = own.line[here[some]], others.way[passed[some], :2]
         # What the drives of one group have in common says the same of the shift.
         alike = config.alike_m * len(some) * len(torch.unique(own.line.owner[here]))
         each = config.sample_spacing_m * count / max(alike, 1)
         reach = float(grid[-1, -1].norm()) + config.sample_spacing_m
         i, j, _ = pairs_between(line.point[:, :2], others.line.point[:, :2], radius=reach)
-        parallel = (line.direction[i] * others.line.direction[j]).sum(1).abs() > MAX_ANGLE_COS
-        pairs = _Pairs.of(line, others.line, i[parallel], j[parallel])
+        beside = (line.direction[i] * others.line.direction[j]).sum(1).abs() > MAX_ANGLE_COS
+        beside &= (others.line.point[j, 2] - line.point[i, 2]).abs() < others.level
+        pairs = _Pairs.of(line, others.line, i[beside], j[beside])
         if len(torch.unique(pairs.row)) * each < 1:
             return None
         fits = torch.stack([_fits(pairs, len(line), shifts, config) for shifts in grid], dim=1)

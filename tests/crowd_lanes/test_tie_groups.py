@@ -195,3 +195,11 @@ def test_several_groups_are_placed_one_after_the_other():
     for drive in (2, 4):
         found = ties.move[drive] - ties.move[0]
         torch.testing.assert_close(found, -torch.tensor(shift).double(), rtol=0, atol=0.3)
+
+
+@pytest.mark.parametrize("height", [6.0, -7.5])
+def test_a_road_over_another_one_is_not_put_onto_it(height: float):
+    lines = [along(x, 600, north=north) for north in (False, True) for x in ROAD]
+    shift = (0.8, -2.6, height)
+    ties = tied(drives([lines, lines], shift), both_ways(shift, 600, turns=True))
+    assert not ties.move.any() and not ties.open_groups
