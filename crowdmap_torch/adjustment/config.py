@@ -102,6 +102,9 @@ class AdjustConfig(Settings):
     convoy_m: LengthOrNone = 50_000.0
     """Where twice as much way was driven and more, drives are adjusted in convoys of about so much or more, wherever there
     are workers for them; 0: all in one. The map is the same but for rounding, and with any workers to the last bit."""
+    influence: bool = False
+    """Whether it is told what the map would be without each of the drives: about as long as two steps, and a factor of the
+    map for every drive."""
 
     def __post_init__(self) -> None:
         """Refuses unknown methods and Jacobians."""

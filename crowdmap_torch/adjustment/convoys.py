@@ -11,6 +11,7 @@ bits on any engine with any number of workers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
@@ -29,7 +30,8 @@ from crowdmap_torch.fleet.company import Company, Program
 from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.fleet.here import InProcess
 from crowdmap_torch.optim.levenberg_marquardt import LmState
-from crowdmap_torch.optim.solvers.journey_system import JourneyBackend, JourneyEquations
+from crowdmap_torch.optim.problem import Problem
+from crowdmap_torch.optim.solvers.journey_system import JourneyBackend, JourneyEquations, MapSystem
 from crowdmap_torch.optim.solvers.normal_equations import MapCovariance
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.processes.memory import give_back
@@ -179,8 +181,10 @@ def drive_along(member: Member) -> None:
             member.for_leader(list, _moved(bundle) if moved else ())
         elif asked == "residuals":
             member.for_leader(list, residual_summary(bundle))
+        elif asked == "systems":
+            _equations(bundle, bundle.problem()).systems()
         else:
-            equations = _equations(bundle, *of)
+            equations = _equations(bundle, bundle.information(*of))
             equations.share_covariance()
             equations.sums_of_chains(*sums_of_bias(bundle))
 
@@ -193,9 +197,9 @@ def _moved(bundle: Bundle) -> tuple[Tensor, ...]:
 
 
 @torch.no_grad()
-def _equations(bundle: Bundle, prior_scale: Float[Tensor, "j _"]) -> JourneyEquations:
-    """Those that tell what is known, with sigmas of that scale."""
-    problem, backend = bundle.information(prior_scale), bundle.backend()
+def _equations(bundle: Bundle, problem: Problem) -> JourneyEquations:
+    """Those of a problem of the bundle where it stands."""
+    backend = bundle.backend()
     assert isinstance(backend, JourneyBackend)
     return backend.assemble(problem, bundle.values())
 
@@ -206,11 +210,20 @@ def _equations(bundle: Bundle, prior_scale: Float[Tensor, "j _"]) -> JourneyEqua
 class Convoys(ExitStack):
     """The convoys of a bundle on the hosts of an engine, a context manager that ends them; and their leader's part."""
 
-    def __init__(self, bundle: Bundle, state: LmState | None, engine: Engine | None = None) -> None:
-        """`bundle` stands where `state` does, and follows step by step; without one no step may be taken."""
+    def __init__(
+        self,
+        bundle: Bundle,
+        state: LmState | None,
+        engine: Engine | None = None,
+        parts: Sequence[tuple[int, int]] | None = None,
+    ) -> None:
+        """`bundle` stands where `state` does, and follows step by step; without one no step may be taken.
+
+        `parts` are the first journey of each convoy and the one behind its last; None: the bundle's convoys.
+        """
         super().__init__()
         self.bundle, self.state = bundle, state
-        self._parts = bundle.convoys
+        self._parts = bundle.convoys if parts is None else parts
         engine = InProcess() if engine is None else engine
         # Behind the company's end: its hosts are gone by then.
         self.push(self._ended)
@@ -262,8 +275,16 @@ class Convoys(ExitStack):
     ) -> tuple[MapCovariance, Float[Tensor, "j 4 4"]]:
         """The covariance of what stays, with sigmas of that scale, and that of the journeys' biases."""
         self._leader.tell(("covariance", prior_scale))
-        covariance = _equations(self._own, prior_scale).covariance()
+        equations = _equations(self._own, self._own.information(prior_scale))
+        covariance = equations.covariance()
         return covariance, covariance.of_sums(*sums_of_bias(self._own))
+
+    def systems(self) -> MapSystem:
+        """What each convoy says of the map where the bundle stands."""
+        self._leader.tell(("systems",))
+        found = _equations(self._own, self._own.problem()).systems()
+        assert found is not None, "of the leader"
+        return found
 
     def _follow(self, moved: list[tuple[Tensor, ...]]) -> None:
         """Has the bundle where the convoys are; `moved` is what each has of its own, nothing where no step was taken.

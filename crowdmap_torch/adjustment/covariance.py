@@ -21,6 +21,7 @@ from crowdmap_torch.adjustment.found_calibration import (
     found_calibration,
     sigma_of_mean,
 )
+from crowdmap_torch.adjustment.influence import Influence, influence
 from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.geometry import polygon, se3, spline_basis
 from crowdmap_torch.geometry.covariances import at_least
@@ -55,6 +56,8 @@ class MapUncertainty:
     """What cars have wrong for good; empty where that is not asked."""
     calibration_mean_sigma: dict[str, tuple[float, ...]]
     """1-sigma of its mean over all cars, by parameter."""
+    influence: Influence | None = None
+    """What the map would be without each of the drives; None: that is not asked."""
 
     @property
     def of_their_own(self) -> Float[Tensor, "n 3 3"]:
@@ -96,8 +99,9 @@ def map_uncertainty(
     bias = (to_bias @ values["drift"][:, :6, None])[..., 0]
     bias = nodes.mean(bias, journeys)
     silent = count == 0
+    center = of_sign[:, :3, :3]
     return MapUncertainty(
-        center=of_sign[:, :3, :3],
+        center=center,
         corner=_corner_covariance(values["sign"], values["size"], signs, of_sign),
         lane_sigma=_lane_sigma(bundle, lanes, covariance),
         shared=(shared + shared.mT) / 2,
@@ -105,6 +109,7 @@ def map_uncertainty(
         bias_covariance=of_bias.masked_fill(silent[:, None, None], torch.nan),
         calibration=found_calibration(bundle, covariance),
         calibration_mean_sigma=sigma_of_mean(bundle, covariance),
+        influence=influence(bundle, center, engine) if bundle.config.influence else None,
     )
 
 

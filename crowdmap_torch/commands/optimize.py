@@ -98,6 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RUN|off",
         help="start from what an earlier run found of the cars; off: rig.yaml is right in all of them",
     )
+    parser.add_argument("--influence", action="store_true", help="what each drive does to the map")
     parser.add_argument(
         "--journeys",
         metavar="ID,ID...",
@@ -159,12 +160,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Maps `options.dataset` into the folder `options.out`; the exit code."""
+    """Maps a dataset into a folder; the exit code."""
     keep_in_one_place()
     with input_read():
         config = load_config(options.config)
         if options.calibration == _OFF:
             config = replace(config, calibration=CalibrationConfig.off())
+        if options.influence:
+            config = replace(config, adjust=replace(config.adjust, influence=True))
     if options.print_config:
         print(dump(config), end="")
         return 0

@@ -34,6 +34,23 @@ class JourneySummary:
     heading_sigma_deg: float = math.nan
     true_bias: tuple[float, float, float] | None = None
     """The same against the true poses (simulated data only)."""
+    without_it: WithoutIt | None = None
+    """None: that is not asked, or it had no say."""
+
+
+@dataclass(frozen=True)
+class WithoutIt:
+    """What the map would be without a journey."""
+
+    in_sigmas: float
+    """By how many of their standard deviations signs that others saw too would be elsewhere (root mean square)."""
+    farthest_m: float
+    """By how much the one that would move farthest; NaN: there is none."""
+    farthest_sign: str | None
+    across_m: float
+    """By how much lanes would be further to a side (root mean square)."""
+    signs_gone: int
+    """Signs that nobody else saw."""
 
 
 @dataclass(frozen=True)
@@ -156,13 +173,15 @@ def journey_summaries(
         true = [(-x, -y, -z) for x, y, z in (t.mean_error_m.tolist() for t in truth.journeys)]
     found = result.uncertainty
     sigmas = found.bias_covariance.diagonal(dim1=1, dim2=2).sqrt()
-    for journey, made, association, bias, sigma, true_bias in zip(
+    without = _without_each(result)
+    for journey, made, association, bias, sigma, true_bias, without_it in zip(
         dataset.journeys,
         result.journey_maps,
         result.associations,
         found.bias.tolist(),
         sigmas.tolist(),
         true,
+        without,
         strict=True,
     ):
         east, north, up, heading = bias
@@ -178,6 +197,22 @@ def journey_summaries(
                 heading_deg=math.degrees(heading),
                 heading_sigma_deg=math.degrees(sigma[3]),
                 true_bias=true_bias,
+                without_it=without_it,
             )
         )
     return tuple(summaries)
+
+
+def _without_each(result: MapResult) -> list[WithoutIt | None]:
+    """What the map would be without each of the journeys."""
+    found, names = result.uncertainty.influence, result.hd_map.sign_id
+    if found is None:
+        return [None] * len(result.journey_maps)
+    each = (x.tolist() for x in (found.in_sigmas, found.farthest_m, found.farthest_sign))
+    lanes, gone = found.across_m.tolist(), found.alone.tolist()
+    return [
+        None
+        if math.isnan(sigmas) and math.isnan(across) and not alone
+        else WithoutIt(sigmas, far, names[sign] if sign >= 0 else None, across, alone)
+        for sigmas, far, sign, across, alone in zip(*each, lanes, gone, strict=True)
+    ]

@@ -12,7 +12,7 @@ from crowdmap_torch.evaluation.statistics import ErrorFigures
 from crowdmap_torch.evaluation.text import number_text, percent_text
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.report.record import RunRecord
-from crowdmap_torch.report.summaries import JourneySummary, Pruned
+from crowdmap_torch.report.summaries import JourneySummary, Pruned, WithoutIt
 from crowdmap_torch.survey.matching import DUPLICATE
 
 _MAX_SIGNS = 5000
@@ -132,7 +132,8 @@ def _errors(figures: MapFigures) -> Iterator[tuple[str, ErrorFigures]]:
 
 
 def bias_table(journeys: Sequence[JourneySummary]) -> str:
-    """One row a journey: what of it was used, its bias with 1-sigma; sortable."""
+    """One row a journey: what of it was used, its bias with 1-sigma, what would be without it; sortable."""
+    asked = any(j.without_it is not None for j in journeys)
     head = (
         "journey",
         "frames",
@@ -143,6 +144,7 @@ def bias_table(journeys: Sequence[JourneySummary]) -> str:
         "north [m]",
         "up [m]",
         "heading [deg]",
+        *(("without it [sigma]", "farthest [m]", "lanes [m]", "signs gone") if asked else ()),
     )
     rows = []
     for j in journeys:
@@ -152,8 +154,23 @@ def bias_table(journeys: Sequence[JourneySummary]) -> str:
         cells.append(_cell(percent_text(share), share))
         cells += [_uncertain_cell(b, s) for b, s in zip(j.bias, j.bias_sigma, strict=True)]
         cells.append(_uncertain_cell(j.heading_deg, j.heading_sigma_deg))
+        if asked:
+            cells += _without_cells(j.without_it)
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return _sortable(head, rows)
+
+
+def _without_cells(found: WithoutIt | None) -> list[str]:
+    """What the map would be without a journey; nothing of one that had no say."""
+    if found is None:
+        return [_cell("-", math.nan)] * 4
+    sign = "" if found.farthest_sign is None else f" {found.farthest_sign}"
+    return [
+        _cell(number_text(found.in_sigmas), found.in_sigmas),
+        _cell(number_text(found.farthest_m) + sign, found.farthest_m),
+        _cell(number_text(found.across_m), found.across_m),
+        _cell(str(found.signs_gone), found.signs_gone),
+    ]
 
 
 def sign_table(record: RunRecord) -> str:

@@ -70,6 +70,7 @@ def metrics_of(
                 "heading_deg": s.heading_deg,
                 "heading_sigma_deg": s.heading_sigma_deg,
                 "sigma_scale": _named_scales(scale),
+                **({} if s.without_it is None else {"without_it": plain(s.without_it)}),
             }
             for s, covariance, scale in zip(
                 summaries,

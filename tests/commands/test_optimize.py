@@ -305,6 +305,18 @@ def test_calibration_off_leaves_rigs_as_they_are(
     assert not (tmp_path / "run" / "rigs").exists()
 
 
+def test_what_each_drive_does_to_the_map_is_told(
+    optimize, tiny_folder: Path, tmp_path: Path, quick: tuple[str, ...]
+):
+    run = tmp_path / "run"
+    assert optimize(tiny_folder, run, *quick, "--influence").code == 0
+    journeys = json.loads((run / "metrics.json").read_text())["journeys"]
+    known = read_map(run / "map").sign_id
+    for found in (journey["without_it"] for journey in journeys):
+        assert 0.05 < found["in_sigmas"] < 2 and 0 < found["farthest_m"] < 2
+        assert found["farthest_sign"] in known and found["across_m"] > 0
+
+
 @pytest.mark.parametrize(
     ("name", "estimate", "message"),
     [

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 
 from crowdmap_torch.report.assets import STYLE
-from crowdmap_torch.report.summaries import JourneySummary, Pruned
+from crowdmap_torch.report.summaries import JourneySummary, Pruned, WithoutIt
 from crowdmap_torch.report.tables_html import (
     bias_table,
     error_table,
@@ -73,6 +73,18 @@ def test_a_bias_that_is_unknown_is_a_dash_and_sorts_last():
     assert (name, used, east, up) == ("a", "-", "-", "+0.000")
     assert north == "+0.250 ± 0.100"
     assert 'data-v=""' in html
+
+
+def test_what_would_be_without_a_journey_has_columns_where_it_is_asked():
+    known, nan = (0.1, 0.1, 0.1), float("nan")
+    summary = JourneySummary("a", 1, 0, 0, 0, known, known)
+    assert len(cells(bias_table([summary]))[1]) == 9
+    pulls = replace(summary, without_it=WithoutIt(0.41, 0.12, "sign-<7>", 0.03, 2))
+    sees_lanes = replace(summary, without_it=WithoutIt(nan, nan, None, 0.01, 0))
+    _, first, second, silent = cells(bias_table([pulls, sees_lanes, summary]))
+    assert first[9:] == ["0.410", "0.120 sign-&lt;7&gt;", "0.030", "2"]
+    assert second[9:] == ["-", "-", "0.010", "0"]
+    assert silent[9:] == ["-"] * 4
 
 
 def test_reasons_come_by_stage_the_most_frequent_first():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from crowdmap_torch.adjustment.influence import Influence
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.io.documents import plain
@@ -61,6 +62,27 @@ def test_covariances_of_corners_are_symmetric_one_for_each_corner(metrics, tiny_
 def test_without_a_survey_there_are_no_figures(metrics):
     assert metrics["survey"] is None
     assert metrics["survey_clusters"] is None
+
+
+def test_what_the_map_would_be_without_a_journey_is_told_where_it_is_asked(
+    metrics, tiny: Dataset, tiny_result: MapResult
+):
+    assert not any("without_it" in journey for journey in metrics["journeys"])
+    figures = (torch.tensor([x, 0.5, torch.nan], dtype=torch.float64) for x in (0.4, 0.1, 0.02))
+    sigmas, far, across = figures
+    found = Influence(sigmas, far, torch.tensor([2, 0, -1]), across, torch.tensor([1, 0, 0]))
+    known = replace(tiny_result.uncertainty, influence=found)
+    result = replace(tiny_result, uncertainty=known)
+    made = plain(metrics_of(tiny, result, MapperConfig(), (), Progress(), {}, None, None))
+    first, _, silent = made["journeys"]
+    assert first["without_it"] == {
+        "in_sigmas": 0.4,
+        "farthest_m": 0.1,
+        "farthest_sign": tiny_result.hd_map.sign_id[2],
+        "across_m": 0.02,
+        "signs_gone": 1,
+    }
+    assert "without_it" not in silent
 
 
 def test_scales_that_could_not_go_further_are_named(tiny: Dataset, tiny_result: MapResult):

@@ -7,17 +7,18 @@ blocks of the border that it has to do with:
 
 with C and b of what is known of the map without any drive. Members make the summands of their drives, each a
 `JourneySystem`; the leader adds them up in the members' order, factors the sum and tells all of them the step y of what
-stays, with which each finds that of its own. The map is the same to the last bit wherever the members are.
+stays, with which each finds that of its own. The map is the same to the last bit wherever the members are. A sum from
+which some are left out is that of a map without their drives: `MapSystem`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
@@ -34,6 +35,7 @@ from crowdmap_torch.optim.solvers.chain_schur import (
     ChainNormalEquations,
 )
 from crowdmap_torch.optim.solvers.landmark_covariance import LandmarkCovariance
+from crowdmap_torch.optim.solvers.layout import Layout
 from crowdmap_torch.optim.solvers.normal_equations import (
     DIAGONAL_FLOOR,
     BorderInformation,
@@ -53,11 +55,14 @@ from crowdmap_torch.processes.together import Together
 
 @dataclass(frozen=True)
 class JourneySystem:
-    """What some drives say of the map at the point where all are: one summand of its normal equations.
+    """What some drives say of the map at one point: one summand of its normal equations."""
 
-    Its cost, and the point, are those of the equations that it comes from.
-    """
-
+    block: Mapping[str, Int[Tensor, " n"]]
+    """By variable the rows of the landmarks that it says something of, and of blocks of the border."""
+    point: Mapping[str, Float[Tensor, "n ..."]]
+    """Where these are: what it says holds there."""
+    cost: Float[Tensor, " 1"]
+    """Of what is the drives' own, there."""
     tile: Int[Tensor, "n 2"]
     """Row and column of every tile of S_d that holds anything, on the diagonal and above it, in the landmarks' grid."""
     entry: Int[Tensor, " m"]
@@ -70,8 +75,10 @@ class JourneySystem:
     """Of b_d - B_d A_d^-1 a_d, there."""
 
     @classmethod
-    def of(cls, system: TileMatrix) -> JourneySystem:
-        """A reduced system and its right-hand side; the tensors are copies."""
+    def of(
+        cls, system: TileMatrix, where: Layout, values: Values, cost: Float[Tensor, " 1"]
+    ) -> JourneySystem:
+        """A reduced system and its right-hand side, of blocks that are `where` in it; the tensors are copies."""
         pattern = system.pattern
         area, flat = pattern.width**2, system.tiles.flatten()
         at = torch.nonzero(flat)[:, 0]
@@ -82,7 +89,21 @@ class JourneySystem:
         row = torch.nonzero(by_row.any(1))[:, 0]
         # Of drives most tiles hold little: it goes to where it is added up in a quarter of their size.
         entry = (number * area + at % area).to(torch.int32)
-        return cls(torch.nonzero(pattern.present)[used], entry, flat[at], row, by_row[row])
+        told = system.diagonal() != 0
+        block = {
+            name: torch.nonzero(told[where.entries(name, slice(None))].any(1))[:, 0]
+            for name in where.offset
+        }
+        return cls(
+            *(block, {name: values[name][of] for name, of in block.items()}, cost),
+            *(torch.nonzero(pattern.present)[used], entry, flat[at], row, by_row[row]),
+        )
+
+    def holds_at(self, values: Values) -> bool:
+        """Whether that is the point where its landmarks are."""
+        return all(
+            torch.equal(values[name][of], self.point[name]) for name, of in self.block.items()
+        )
 
     def add_to(self, system: TileMatrix) -> None:
         """Adds it to a system whose grid is the same and that has its tiles, in place."""
@@ -125,7 +146,7 @@ class JourneyBackend:
         return JourneyEquations(
             *(costs.total, costs.by_term, own, self.together),
             *(total["gradient"], total["diagonal"]),
-            self._summed,
+            *(values, self._summed),
         )
 
 
@@ -143,10 +164,7 @@ class Summed:
         # The last factors are in the same memory.
         self.factor = None
         pattern = own.structure.reduced
-        present = torch.zeros_like(pattern.present)
-        for tile in tiles:
-            row, column = tile.long().unbind(1)
-            present[row, column] = True
+        present = _with_tiles(pattern, tiles)
         if self.system is not None and (
             present.shape == self.system.pattern.present.shape
             and not bool((present & ~self.system.pattern.present).any())
@@ -154,19 +172,18 @@ class Summed:
             return
         # The old one goes before the new one comes.
         self.system = None
-        device = present.device
-        whole = TilePattern.of(pattern.dim, pattern.width, present.cpu().numpy(), device).filled()
-        self.system = TileMatrix.zeros(whole, own.gradient)
+        self.system = TileMatrix.zeros(_filled(pattern, present), own.gradient)
 
     def factorise(
-        self, added: Float[Tensor, " r"], parts: Iterator[JourneySystem]
+        self, added: Float[Tensor, " r"], parts: Iterator[JourneySystem], values: Values
     ) -> Float[Tensor, " r"] | None:
-        """The right-hand side of the sum, which is factorised; None: it is not positive definite."""
+        """The right-hand side of the sum at `values`, which is factorised; None: it is not positive definite."""
         system = self.system
         assert system is not None, "of the leader"
         self.factor = None
         system.flat.zero_()
         for part in parts:
+            assert part.holds_at(values), "systems of one point are added up"
             part.add_to(system)
         system.add_diagonal(added)
         self.factor, self.added = TiledCholesky.of(system), added
@@ -192,6 +209,8 @@ class JourneyEquations:
     """b, of all."""
     diagonal: Float[Tensor, " r"]
     """Of C, of all."""
+    values: Values = field(repr=False)
+    """The point."""
     summed: Summed = field(repr=False)
 
     def solve(self, damping: Float[Tensor, " 1"]) -> Step:
@@ -202,7 +221,9 @@ class JourneyEquations:
         added_y = damping * self.diagonal.clamp_min(DIAGONAL_FLOOR)
 
         def stepped(parts: Iterator[JourneySystem]) -> tuple[Tensor, Tensor] | None:
-            right_side = self.summed.factorise(added_y + own.structure.where.gaps, parts)
+            right_side = self.summed.factorise(
+                added_y + own.structure.where.gaps, parts, self.values
+            )
             if right_side is None:
                 return None
             y = -self.summed.solve(right_side)
@@ -228,7 +249,20 @@ class JourneyEquations:
 
     def _system(self, added_x: Float[Tensor, "e k"]) -> JourneySystem:
         """One's own summand."""
-        return JourneySystem.of(self.own.reduce(added_x, None)[0])
+        own = self.own
+        system, _ = own.reduce(added_x, None)
+        return JourneySystem.of(system, own.structure.where, self.values, own.cost)
+
+    def systems(self) -> MapSystem | None:
+        """The summands of all, of what is undamped: the leader's; of a member nothing."""
+        own = self.own
+
+        def of_all(parts: Iterator[JourneySystem]) -> MapSystem:
+            return MapSystem(own.structure.where, own.structure.reduced, tuple(parts))
+
+        return self.together.for_leader(
+            of_all, self._system(torch.zeros_like(own.eliminated_gradient))
+        )
 
     @property
     def tangent_gradient(self) -> dict[str, Tensor]:
@@ -266,7 +300,7 @@ class JourneyEquations:
         added[: own.structure.border_begin] += floor
 
         def factored(parts: Iterator[JourneySystem]) -> bool:
-            return self.summed.factorise(added, parts) is not None
+            return self.summed.factorise(added, parts, self.values) is not None
 
         nothing = torch.zeros_like(own.eliminated_gradient)
         if not self.together.met(factored, self._system(nothing)):
@@ -299,6 +333,56 @@ class JourneyEquations:
         if summed.factor is None or summed.added is None:
             return BorderInformation(self.gradient.new_zeros(0, 0), {})
         return border_information(self.own.structure, summed.factor, summed.added)
+
+
+@dataclass(frozen=True)
+class MapSystem:
+    """The summands of a map's normal equations at one point, any of which may be left out."""
+
+    where: Layout
+    pattern: TilePattern
+    """Of the landmarks' grid, whichever tiles it has."""
+    systems: tuple[JourneySystem, ...]
+    """The leader's, of what is known without any drive, then one for each member."""
+
+    @property
+    def of_drives(self) -> tuple[JourneySystem, ...]:
+        """The members'."""
+        return self.systems[1:]
+
+    def step(self, *, without: Collection[int] = ()) -> dict[str, Tensor]:
+        """The step to the least cost of all but some members, numbered from 0, by variable; of what is common to all.
+
+        Landmarks that nobody else saw stay where what is known without any drive holds them. ValueError: the sum is not
+        positive definite.
+        """
+        systems = [one for n, one in enumerate(self.systems) if n - 1 not in without or not n]
+        present = _with_tiles(self.pattern, (one.tile for one in systems))
+        total = TileMatrix.zeros(_filled(self.pattern, present), systems[0].information)
+        for one in systems:
+            one.add_to(total)
+        gaps = self.where.gaps
+        total.add_diagonal(torch.where(gaps, 1.0, UNOBSERVED_FLOOR).to(total.flat))
+        right_side = total.right_side[:, None].clone()
+        factor = TiledCholesky.of(total)
+        if factor is None:
+            raise ValueError("the normal equations of the map are not positive definite")
+        return self.where.unpack(-factor.solve(right_side)[None, :, 0])
+
+
+def _with_tiles(pattern: TilePattern, tiles: Iterator[Int[Tensor, "n 2"]]) -> Bool[Tensor, "t t"]:
+    """Which tiles of a grid some have."""
+    present = torch.zeros_like(pattern.present)
+    for tile in tiles:
+        row, column = tile.long().unbind(1)
+        present[row, column] = True
+    return present
+
+
+def _filled(pattern: TilePattern, present: Bool[Tensor, "t t"]) -> TilePattern:
+    """That of the factor of a matrix with these tiles of a grid."""
+    of = TilePattern.of(pattern.dim, pattern.width, present.cpu().numpy(), present.device)
+    return of.filled()
 
 
 def _along(step: Tensor, gradient: Tensor, added: Tensor) -> Float[Tensor, " 3"]:

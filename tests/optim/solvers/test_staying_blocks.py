@@ -58,6 +58,12 @@ def blocks(seed):
     return StayingBlocks(where, own, tuple(of.joined(19) for of in between)), full
 
 
+def summand_of(system, where):
+    """What a system says at some point, which costs nothing."""
+    values = {"sign": torch.arange(12.0).view(3, 4), "lane": torch.arange(6.0).view(2, 3)}
+    return JourneySystem.of(system, where, values, torch.zeros(1)), values
+
+
 def all_tiles(full):
     count = -(-len(full) // WIDTH)
     pattern = TilePattern.of(len(full), WIDTH, np.ones((count, count), bool), full.device)
@@ -85,7 +91,7 @@ def test_a_summand_holds_the_numbers_that_are_there_and_adds_them_to_others(seed
     system = all_tiles(full)
     found.add_to(system)
     system.right_side.copy_(torch.arange(19.0))
-    summand = JourneySystem.of(system)
+    summand, _ = summand_of(system, found.where)
     assert len(summand.information) == int((system.tiles != 0).sum())
     total = all_tiles(full)
     for _ in range(2):
@@ -100,4 +106,21 @@ def test_a_sum_without_the_tiles_of_a_summand_is_refused():
     found.add_to(system)
     diagonal = TilePattern.of(19, WIDTH, np.eye(3, dtype=bool), full.device)
     with pytest.raises(AssertionError, match="has the tiles of its summands"):
-        JourneySystem.of(system).add_to(TileMatrix.zeros(diagonal, full))
+        summand_of(system, found.where)[0].add_to(TileMatrix.zeros(diagonal, full))
+
+
+def test_a_summand_knows_its_landmarks_and_where_they_are():
+    found, full = blocks(0)
+    system = all_tiles(full)
+    found.add_to(system)
+    # Nothing is said of the second sign, nor of the first lane point.
+    system.tiles[...] = system.tiles * 0
+    system.add_diagonal((torch.arange(19) < 4).double() + (torch.arange(19) >= 16))
+    summand, values = summand_of(system, found.where)
+    assert {name: of.tolist() for name, of in summand.block.items()} == {"sign": [0], "lane": [1]}
+    assert torch.equal(summand.point["lane"], values["lane"][1:])
+    assert summand.holds_at(values)
+    elsewhere = {**values, "lane": values["lane"] + 1e-12 * torch.arange(3.0).double()}
+    assert not summand.holds_at(elsewhere)
+    others = {**values, "sign": values["sign"] + torch.tensor([[0.0], [1.0], [1.0]])}
+    assert summand.holds_at(others)
