@@ -151,6 +151,17 @@ def _errors(record: RunRecord) -> str:
     return drawn + error_table(record.figures, record.figures_before)
 
 
+_BIAS = (
+    "Bias: what is to be added to the positions as given, in the mean over the journey. What all journeys have wrong "
+    "alike is in none of them."
+)
+_WITHOUT_IT = (
+    " Without it: how far signs that others saw too would be elsewhere, in their standard deviations; the sign that would "
+    "move farthest; lanes, across; signs that nobody else saw. Of n journeys that say as much as each other any moves "
+    "signs by 1 / sqrt(n - 1)."
+)
+
+
 def _journeys(record: RunRecord) -> str:
     named = [
         *(("set aside", r) for r in record.rejected),
@@ -168,11 +179,9 @@ def _journeys(record: RunRecord) -> str:
         )
     if not record.journeys:
         return warning
+    asked = any(j.without_it for j in record.journeys)
     return (
-        note(
-            "Bias: what is to be added to the positions as given, in the mean over the journey. What all journeys have "
-            "wrong alike is in none of them."
-        )
+        note(_BIAS + _WITHOUT_IT if asked else _BIAS)
         + charts_html(charts.bias_charts(record.journeys))
         + bias_table(record.journeys)
         + warning

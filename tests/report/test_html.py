@@ -11,6 +11,7 @@ import torch
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.report.html import report_html, write_report
 from crowdmap_torch.report.record import RunRecord
+from crowdmap_torch.report.summaries import WithoutIt
 from crowdmap_torch.report.tables_html import sign_table
 
 VOID = {"meta", "input", "br", "link", "img"}
@@ -82,6 +83,14 @@ def test_the_verdict_stands_above_all_and_what_is_poor_above_what_is_well(record
     assert 'class="verdict poor"' in text and "The map is poor." in text
     first = text[text.index("<li") : text.index("</li>")]
     assert "no signs" in first and "rays do not meet; check the poses" in first
+
+
+def test_what_would_be_without_a_journey_is_explained_where_it_is_asked(record: RunRecord):
+    assert "Without it" not in report_html(record)
+    first, *others = record.journeys
+    asked = replace(first, without_it=WithoutIt(0.4, 0.1, "sign-7", 0.02, 0))
+    html = report_html(replace(record, journeys=(asked, *others)))
+    assert "Without it" in html and "0.100 sign-7" in html
 
 
 def test_the_head_says_what_was_mapped_when_and_with_what(text: str):
