@@ -137,7 +137,7 @@ class Journey:
     frame_number: Int[Tensor, " f"]
     t_ns: Int[Tensor, " f"]
     T_world_camera: Float[Tensor, "f 4 4"]
-    """The positioning module's poses, through the mount: biased by up to a metre, drifting slowly, without its leaps."""
+    """The positioning module's poses, through the mount: biased by up to a metre, drifting slowly, put right."""
     sigma_position: Float[Tensor, "f 3"] | None
     """The positioning module's own 1-sigma, east north up [m]."""
     sigma_rotation: Float[Tensor, " f"] | None
@@ -151,6 +151,8 @@ class Journey:
     """Whose drives share a calibration; empty: those of the rig do."""
     leaps_m: tuple[float, ...] = ()
     """How far positions leapt between two frames where the drive was put together again at the door [m]."""
+    noisy_frames: int = 0
+    """Frames whose positions were noisy for a while, and were smoothed at the door."""
 
     def __repr__(self) -> str:
         return f"Journey({self.journey_id!r}: {_driven((self,))})"

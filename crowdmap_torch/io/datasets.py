@@ -25,6 +25,7 @@ from crowdmap_torch.io.errors import InputError, one_line
 from crowdmap_torch.io.poses import read_poses
 from crowdmap_torch.io.remote import Url, at_hand, matching, place_of
 from crowdmap_torch.io.rigs import read_rig
+from crowdmap_torch.noise.bursts import without_bursts
 from crowdmap_torch.noise.freezes import driven_on, frozen_frames
 from crowdmap_torch.noise.leaps import without_leaps
 from crowdmap_torch.processes.at_rest import rest
@@ -212,6 +213,7 @@ def _load_journey(
     T_world_link, frozen = poses.T_world_link, frozen_frames(poses.T_world_link, poses.t_ns)
     if bool(frozen.any()):
         T_world_link = driven_on(T_world_link, poses.t_ns, frozen)
+    T_world_link, noisy = without_bursts(T_world_link, poses.t_ns)
     T_world_link, leaps_m = without_leaps(T_world_link, poses.t_ns)
     journey = Journey(
         journey_id=journey_id,
@@ -227,6 +229,7 @@ def _load_journey(
         dropped=signs.dropped | lanes.dropped,
         vehicle_id=_vehicle_id(head.content.get("vehicle_id")),
         leaps_m=tuple(leaps_m.tolist()),
+        noisy_frames=noisy,
     )
     if bool(frozen.any()):
         journey = seen_in(journey, ~frozen, FROZEN)

@@ -15,12 +15,12 @@ from crowdmap_torch.processes.sums import running_sum
 
 _FASTEST_MPS = 70.0
 """Speed that no car exceeds."""
-_HARDEST_MPS2 = 12.0
+HARDEST_MPS2 = 12.0
 """Acceleration that no car exceeds."""
 _LEAST_M = 0.5
 """Shorter leaps are left where they are: drift goes as far within some frames."""
 _OF_NOISE = 6.0
-"""Times by which a leap stands out against what steps usually change by from one to the next."""
+"""Times by which a leap stands out against what steps usually change by from one to the next, in the drive and there."""
 _MOST_M = 15.0
 """Longer leaps are left where they are: positioning lost its way there, or two drives stand in one file."""
 _TURNS_RADPS = 1.0
@@ -31,6 +31,8 @@ _MOST_OFTEN = 0.05
 """Where more steps leap positions are not those of each frame."""
 _HALF_WINDOW = 3
 """Steps before and behind one whose median is how the car drives there."""
+_NOISE_WINDOW = 8
+"""Steps before and behind one whose changes say how noisy positions are there: between buildings they may be for seconds."""
 
 
 def largest_leap(position: Float[Tensor, "f 3"], t_ns: Int[Tensor, " f"]) -> Float[Tensor, ""]:
@@ -51,7 +53,7 @@ def _beyond_driving(position: Float[Tensor, "f 3"], t_ns: Int[Tensor, " f"]) -> 
         return (step.norm(dim=1) - _FASTEST_MPS * seconds).clamp_min(0)
     velocity = step / seconds[:, None]
     # The speed of a step is that of its middle: from there to the next step's middle it may change.
-    change = _HARDEST_MPS2 * (seconds[1:] + seconds[:-1]) / 2
+    change = HARDEST_MPS2 * (seconds[1:] + seconds[:-1]) / 2
     faster = (velocity.diff(dim=0).norm(dim=1) - change).clamp_min(0)
     by_time = _against_both(faster) * seconds
     return torch.minimum(by_time, _against_both(step.diff(dim=0).norm(dim=1)))
@@ -81,7 +83,7 @@ def _goes_on(
     change = (median_along(behind, 1) - median_along(before, 1)).norm(dim=-1)
     # From the middle of those before to the middle of those behind.
     between = (_HALF_WINDOW + 1) * seconds[at]
-    brakes = _HARDEST_MPS2 * seconds[at] * between
+    brakes = HARDEST_MPS2 * seconds[at] * between
     return (turn < _LOOKS_ON_RAD + _TURNS_RADPS * seconds[at]) & (
         change < brakes + _OF_NOISE * usual
     )
@@ -98,9 +100,14 @@ def without_leaps(
     step = position.diff(dim=0)
     if len(step) < 2 * _HALF_WINDOW:
         return T_world_camera, step.new_zeros(0)
-    usual = median_along(step.diff(dim=0).norm(dim=1), 0)
-    least = (_OF_NOISE * usual).clamp_min(_LEAST_M)
-    at = torch.nonzero(_beyond_driving(position, t_ns) > least)[:, 0]
+    change = step.diff(dim=0).norm(dim=1)
+    usual = median_along(change, 0)
+    beyond = _beyond_driving(position, t_ns)
+    at = torch.nonzero(beyond > (_OF_NOISE * usual).clamp_min(_LEAST_M))[:, 0]
+    beside = torch.arange(-_NOISE_WINDOW, _NOISE_WINDOW, device=at.device)
+    there = change[(at[:, None] + beside).clamp(0, len(change) - 1)]
+    least = (_OF_NOISE * torch.maximum(usual, median_along(there, 1))).clamp_min(_LEAST_M)
+    at, least = at[beyond[at] > least], least[beyond[at] > least]
     near = torch.arange(-_HALF_WINDOW, _HALF_WINDOW + 1, device=at.device)
     around = (at[:, None] + near).clamp(0, len(step) - 1)
     seconds = t_ns.diff().to(step) * 1e-9

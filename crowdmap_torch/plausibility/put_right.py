@@ -1,4 +1,4 @@
-"""What is told of faults of positions that are put right as a drive is read: leaps, and poses that freeze."""
+"""What is told of faults of positions that are put right as a drive is read: leaps, bursts of noise, poses that freeze."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ FRAMES_LEFT_OUT = "frozen-poses"
 """Kind of the finding that tells of frames whose detections a map does without."""
 LEAPS_TAKEN_OUT = "leaps-taken-out"
 """Kind of the finding that tells of leaps that a map does without."""
+SMOOTHED = "noise-smoothed"
+"""Kind of the finding that tells of bursts of noise that a map does without."""
 
 
 def put_right_findings(journey: Journey) -> Iterator[Finding]:
     """What was put right in a journey as it was read."""
     yield from _freezes(journey)
+    yield from _bursts(journey)
     yield from _leaps(journey)
 
 
@@ -28,6 +31,16 @@ def _freezes(journey: Journey) -> Iterator[Finding]:
             f"positions stay where they are while the car drives on, and {left} detections are in such frames",
             "positioning was lost for a moment",
             "nothing: these detections are left out",
+        )
+
+
+def _bursts(journey: Journey) -> Iterator[Finding]:
+    if journey.noisy_frames:
+        yield Finding(
+            SMOOTHED,
+            f"positions jump to and fro in {journey.noisy_frames:,} of {journey.frame_count:,} frames, as no car does",
+            "satellites were hidden for a while, as between tall buildings",
+            "nothing: positions are smoothed there",
         )
 
 

@@ -127,7 +127,7 @@ def make_journey(
 ) -> SimulatedJourney:
     """The `index`-th journey; it does not depend on how many there are."""
     rng = np.random.default_rng([config.seed, _JOURNEY, index])
-    drive_rng, pose_rng, sign_rng, lane_rng, fault_rng = rng.spawn(5)
+    drive_rng, pose_rng, sign_rng, lane_rng, fault_rng, burst_rng = rng.spawn(6)
     vehicle = fleet[index % len(fleet)]
     # With both directions the vehicles take turns in pairs, so that each of them drives both ways.
     direction = 1
@@ -139,7 +139,10 @@ def make_journey(
         drive.distance, config.positioning, np.random.default_rng([config.seed, _DRIVE, index])
     )
     error = pose_errors(drive.distance, config.positioning, pose_rng)
-    error = replace(error, translation=error.translation + wrong.shift(drive.distance))
+    shift = wrong.shift(drive.distance)
+    if wrong.bursts is not None:
+        shift = shift + wrong.bursts.noise(drive.distance, drive.t, burst_rng)
+    error = replace(error, translation=error.translation + shift)
     T_reported = measured_poses(_stamped_poses(drive, vehicle), error)
     if wrong.freezes is not None:
         T_reported = wrong.freezes.held(T_reported, drive.distance, drive.t)

@@ -1,4 +1,4 @@
-"""The positioning module: true poses with a wandering bias, drift, noise, outages, leaps and freezes; its own sigmas."""
+"""The positioning module: true poses with a wandering bias, drift, noise and what receivers do; its own sigmas."""
 
 from __future__ import annotations
 
@@ -87,6 +87,12 @@ class PositioningConfig(Settings):
     freezes_per_km: Rate = 0.0
     """How often a pose stays what it is while the car drives on, and is then right again; no sigma says so."""
     freeze_s: Seconds = 2.0
+    """For how long."""
+    bursts_per_km: Rate = 0.0
+    """How often positions are noisy from frame to frame for a while, as between tall buildings; no sigma says so."""
+    burst_m: LengthOrNone = 0.5
+    """1-sigma of that noise, east, north and up alike."""
+    burst_s: Seconds = 3.0
     """For how long."""
     sigmas: bool = True
     """False: the sigma columns are left out."""
@@ -188,6 +194,28 @@ class Freezes:
 
 
 @dataclass(frozen=True)
+class Bursts:
+    """Where a drive's positions are noisy for a while."""
+
+    at_m: tuple[float, ...]
+    """Way travelled."""
+    lasts_s: float
+    sigma_m: float
+
+    def noise(
+        self,
+        distance: Float[np.ndarray, " f"],
+        t: Float[np.ndarray, " f"],
+        rng: np.random.Generator,
+    ) -> Float[np.ndarray, "f 3"]:
+        """Error of the position at the frames [m]."""
+        is_noisy = np.zeros(len(t), dtype=bool)
+        for first in np.searchsorted(distance, self.at_m).clip(0, len(t) - 1):
+            is_noisy |= (t >= t[first]) & (t < t[first] + self.lasts_s)
+        return self.sigma_m * is_noisy[:, None] * rng.normal(size=(len(t), 3))
+
+
+@dataclass(frozen=True)
 class DriveErrors:
     """What is wrong with the positioning of one drive, and is not said."""
 
@@ -197,6 +225,7 @@ class DriveErrors:
     wander: Wander | None = None
     leaps: Leaps | None = None
     freezes: Freezes | None = None
+    bursts: Bursts | None = None
 
     def shift(self, distance: Float[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
         """Error of the position at the frames [m], by way travelled."""
@@ -226,25 +255,34 @@ def drive_errors(
     wander = _wander(distance, config, rng) if config.bias_wander_m else None
     leaps = _leaps(distance, config, rng) if config.leaps_per_km and config.leap_m else None
     freezes = _freezes(distance, config, rng) if config.freezes_per_km else None
+    bursts = None
+    if config.bursts_per_km and config.burst_m:
+        at = _now_and_then(distance, config.bursts_per_km, rng)
+        bursts = Bursts(at, config.burst_s, config.burst_m)
     outage = outage if has_outage and size > 0 else None
-    return DriveErrors(float(np.exp(log_factor)), outage, wander, leaps, freezes)
+    return DriveErrors(float(np.exp(log_factor)), outage, wander, leaps, freezes, bursts)
+
+
+def _now_and_then(
+    distance: Float[np.ndarray, " f"], per_km: float, rng: np.random.Generator
+) -> tuple[float, ...]:
+    """Ways travelled at which something happens that happens so often."""
+    count = rng.poisson(per_km * distance[-1] / 1000)
+    return tuple(np.sort(rng.uniform(0, distance[-1], count)).tolist())
 
 
 def _freezes(
     distance: Float[np.ndarray, " f"], config: PositioningConfig, rng: np.random.Generator
 ) -> Freezes:
-    count = rng.poisson(config.freezes_per_km * distance[-1] / 1000)
-    at = np.sort(rng.uniform(0, distance[-1], count))
-    return Freezes(tuple(at.tolist()), config.freeze_s)
+    return Freezes(_now_and_then(distance, config.freezes_per_km, rng), config.freeze_s)
 
 
 def _leaps(
     distance: Float[np.ndarray, " f"], config: PositioningConfig, rng: np.random.Generator
 ) -> Leaps:
-    count = rng.poisson(config.leaps_per_km * distance[-1] / 1000)
-    at = np.sort(rng.uniform(0, distance[-1], count))
-    by = config.leap_m * rng.normal(size=(count, 3))
-    return Leaps(tuple(at.tolist()), tuple((float(e), float(n), float(u)) for e, n, u in by))
+    at = _now_and_then(distance, config.leaps_per_km, rng)
+    by = config.leap_m * rng.normal(size=(len(at), 3))
+    return Leaps(at, tuple((float(e), float(n), float(u)) for e, n, u in by))
 
 
 def _wander(

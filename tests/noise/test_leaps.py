@@ -120,6 +120,18 @@ def test_what_is_no_leap_of_a_receiver_is_left_alone():
         assert same is other and not len(lengths)
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("rate_hz", [10.0, 30.0])
+def test_noise_between_buildings_is_no_leap(rate_hz: float, seed: int):
+    T, t_ns = driven(rate_hz, 60.0, seed)
+    draw = torch.Generator().manual_seed(seed)
+    noisy, begin = T.clone(), len(T) // 5
+    noise = 0.5 * torch.randn(45, 3, generator=draw, dtype=F64)
+    noisy[begin : begin + 45, :3, 3] += noise
+    same, lengths = without_leaps(noisy, t_ns)
+    assert same is noisy and not len(lengths)
+
+
 def test_drives_are_put_together_as_they_are_read_and_say_so(winding_folder: Path, tmp_path: Path):
     folder = Path(shutil.copytree(winding_folder, tmp_path / "leapt"))
     path = folder / "journeys/journey-001/poses.parquet"

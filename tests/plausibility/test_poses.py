@@ -102,6 +102,13 @@ def test_leaps_that_a_map_does_without_are_told() -> None:
     assert "2 times" in found.evidence and "2.4 m" in found.evidence
 
 
+def test_bursts_of_noise_that_a_map_does_without_are_told() -> None:
+    journey = drive(torch.zeros(60).double())
+    (found,) = pose_findings(replace(journey, noisy_frames=40), ORIGIN)
+    assert (found.kind, found.repair) == ("noise-smoothed", None)
+    assert f"40 of {journey.frame_count} frames" in found.evidence
+
+
 def test_times_in_another_unit_are_named() -> None:
     journey = drive(torch.zeros(60).double())
     assert kinds(replace(journey, t_ns=journey.t_ns // 1000)) == ["frame-times"]

@@ -228,15 +228,32 @@ def test_poses_freeze_as_often_and_as_long_as_they_are_told():
     assert (held[rows, 0, 3] == np.ceil(one.at_m)[:, None]).all()
 
 
+def test_positions_are_noisy_as_often_and_as_long_as_they_are_told():
+    config = replace(PAPER, bursts_per_km=2.0, burst_m=0.4, burst_s=1.5)
+    distance = np.linspace(0.0, 2000.0, 2001)
+    t = distance / 10.0
+    drawn = [drive_errors(distance, config, np.random.default_rng(k)).bursts for k in range(400)]
+    bursts = [burst for burst in drawn if burst is not None]
+    assert np.mean([len(burst.at_m) for burst in bursts]) == pytest.approx(4.0, rel=0.1)
+    one = next(b for b in bursts if len(b.at_m) == 2 and b.at_m[1] - b.at_m[0] > 50)
+    noise = np.array([one.noise(distance, t, np.random.default_rng(k)) for k in range(200)])
+    # Every 0.1 s a frame: 15 of them each time.
+    rows = np.ceil(one.at_m).astype(int)[:, None] + np.arange(15)
+    rows = rows[rows < len(t)]
+    assert np.flatnonzero(noise.any((0, 2))).tolist() == rows.tolist()
+    assert noise[:, rows].std() == pytest.approx(0.4, rel=0.05)
+
+
 def test_what_else_is_drawn_of_a_drive_does_not_depend_on_whether_its_position_leaps():
     config = replace(PAPER, outages=1.0, bias_wander_m=1.0)
     distance = np.array([0.0, 2500.0])
     still, leaping = (
         drive_errors(distance, c, np.random.default_rng(4))
-        for c in (config, replace(config, leaps_per_km=4.0, freezes_per_km=2.0))
+        for c in (config, replace(config, leaps_per_km=4.0, freezes_per_km=2.0, bursts_per_km=2.0))
     )
     assert still.leaps is None and leaping.leaps is not None and leaping.freezes is not None
-    assert replace(leaping, leaps=None, freezes=None) == still
+    assert leaping.bursts is not None
+    assert replace(leaping, leaps=None, freezes=None, bursts=None) == still
 
 
 def test_what_else_is_drawn_of_a_drive_does_not_depend_on_whether_its_bias_wanders():
