@@ -104,8 +104,9 @@ def without_leaps(
     usual = median_along(change, 0)
     beyond = _beyond_driving(position, t_ns)
     at = torch.nonzero(beyond > (_OF_NOISE * usual).clamp_min(_LEAST_M))[:, 0]
-    beside = torch.arange(-_NOISE_WINDOW, _NOISE_WINDOW, device=at.device)
-    there = change[(at[:, None] + beside).clamp(0, len(change) - 1)]
+    beside = torch.arange(2 * _NOISE_WINDOW, device=at.device)
+    first = (at - _NOISE_WINDOW).clamp(0, max(len(change) - len(beside), 0))
+    there = change[(first[:, None] + beside).clamp_max(len(change) - 1)]
     least = (_OF_NOISE * torch.maximum(usual, median_along(there, 1))).clamp_min(_LEAST_M)
     at, least = at[beyond[at] > least], least[beyond[at] > least]
     near = torch.arange(-_HALF_WINDOW, _HALF_WINDOW + 1, device=at.device)

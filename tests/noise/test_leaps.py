@@ -99,6 +99,16 @@ def test_a_drive_goes_on_where_it_leaps_and_its_mean_stays(rate_hz: float, seed:
     assert torch.equal(found[:, :3, :3], T[:, :3, :3])
 
 
+@pytest.mark.parametrize("behind", [4, 6, 9])
+def test_a_leap_a_few_frames_from_either_end_is_one(behind: int):
+    T, t_ns = driven(10.0, 60.0, 0)
+    for row in (behind, len(T) - behind):
+        leapt = T.clone()
+        leapt[row:, :3, 3] += torch.tensor([2.0, -1.5, 0.5], dtype=F64)
+        _, lengths = without_leaps(leapt, t_ns)
+        assert len(lengths) == 1
+
+
 def test_what_is_no_leap_of_a_receiver_is_left_alone():
     T, t_ns = driven(10.0, 60.0, 0)
     n = len(T)
