@@ -47,14 +47,14 @@ def influence(
     heard = torch.unique(nodes).tolist()
     with Convoys(bundle, None, engine, [(n, n + 1) for n in heard]) as convoys:
         whole = convoys.systems()
-    here, journeys = whole.step(), len(bundle.prior_scale)
-    sigmas = torch.full((journeys,), torch.nan).to(center_covariance)
-    found = Influence(
-        *(sigmas, sigmas.clone(), torch.full_like(nodes, -1)[:1].repeat(journeys)),
-        *(sigmas.clone(), torch.zeros_like(nodes)[:1].repeat(journeys)),
-    )
+    unknown = center_covariance.new_full((len(bundle.prior_scale),), torch.nan)
+    none = nodes.new_zeros(len(unknown))
+    found = Influence(unknown, unknown.clone(), none - 1, unknown.clone(), none)
+    here, values = whole.step(), bundle.values()
+    if here is None:
+        return found
     seen_by = {
-        name: _counts(nodes, [one.block[name] for one in whole.of_drives], len(here[name]))
+        name: _counts(nodes, [one.block[name] for one in whole.of_drives], len(values[name]))
         for name in ("sign", "lane")
     }
     whitened = torch.linalg.cholesky(center_covariance)
@@ -62,6 +62,8 @@ def influence(
         own, there = whole.of_drives[part], whole.step(without=[part])
         sign, lane = (own.block[name] for name in ("sign", "lane"))
         found.alone[journey] = (seen_by["sign"][sign] == 1).sum()
+        if there is None:
+            continue
         sign, lane = sign[seen_by["sign"][sign] > 1], lane[seen_by["lane"][lane] > 1]
         if len(sign):
             move = (there["sign"] - here["sign"])[sign, :3]

@@ -35,7 +35,7 @@ _AT_ONCE_S = 0.005
 
 
 def _noise(position: Float[Tensor, "f 3"], t_ns: Int[Tensor, " f"]) -> Float[Tensor, " f"]:
-    """1-sigma of the positions' noise along each axis where they jump as no car does, nor they elsewhere [m]; or zero."""
+    """1-sigma of positions along each axis [m] where they jump as no car does and six times as much as usual, else zero."""
     noise = torch.zeros_like(position[:, 0])
     step = position.diff(dim=0)
     if len(step) <= 2 * _HALF_WINDOW + 1:

@@ -15,11 +15,18 @@ from crowdmap_torch.adjustment.covariance import map_uncertainty
 from crowdmap_torch.adjustment.influence import influence
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.optim.solvers.journey_system import MapSystem
+from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 
 
 def systems(bundle: Bundle, drives: list[int]) -> MapSystem:
     with Convoys(bundle, None, parts=[(n, n + 1) for n in drives]) as convoys:
         return convoys.systems()
+
+
+def step(whole: MapSystem, *without: int) -> dict[str, Tensor]:
+    found = whole.step(without=without)
+    assert found is not None
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +57,9 @@ def test_systems_add_up_to_the_map(bundle, whole):
     equations = bundle.backend().assemble(problem, bundle.values())
     cost = torch.stack([one.cost for one in whole.systems]).sum()
     torch.testing.assert_close(cost, equations.cost[0], rtol=1e-9, atol=0)
-    step = equations.solve(torch.zeros(1, dtype=torch.float64)).delta
+    undamped = equations.solve(torch.zeros(1, dtype=torch.float64)).delta
     for name in ("sign", "lane"):
-        torch.testing.assert_close(whole.step()[name], step[name], rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(step(whole)[name], undamped[name], rtol=1e-3, atol=1e-6)
 
 
 def test_every_drive_says_something_of_what_it_saw_alone(bundle, whole, every):
@@ -63,14 +70,14 @@ def test_every_drive_says_something_of_what_it_saw_alone(bundle, whole, every):
 
 def test_what_is_left_out_is_as_if_it_had_never_been(bundle, whole, every):
     others = systems(bundle, [n for n in every if n != 1])
-    for name, of in others.step().items():
-        assert torch.equal(of, whole.step(without=[1])[name])
+    for name, of in step(others).items():
+        assert torch.equal(of, step(whole, 1)[name])
 
 
 def test_what_a_map_would_be_without_a_drive_is_foretold(street, bundle, whole, every):
-    here, step = bundle.values()["sign"][:, :3, 3], whole.step()["sign"]
+    here, at_rest = bundle.values()["sign"][:, :3, 3], step(whole)["sign"]
     for drive in every:
-        foretold = (whole.step(without=[drive])["sign"] - step)[:, :3]
+        foretold = (step(whole, drive)["sign"] - at_rest)[:, :3]
         seen_by = torch.stack(
             [
                 torch.isin(torch.arange(len(here)), one.block["sign"])
@@ -93,12 +100,12 @@ def test_figures_are_those_of_the_moves(bundle, whole, street, every):
         own = whole.of_drives[drive].block["sign"]
         shared = own[number[own] > 1]
         assert int(found.alone[drive]) == len(own) - len(shared)
-        move = (whole.step(without=[drive])["sign"] - whole.step()["sign"])[shared, :3]
+        move = (step(whole, drive)["sign"] - step(whole)["sign"])[shared, :3]
         assert float(found.farthest_m[drive]) == pytest.approx(float(move.norm(dim=1).max()))
         assert int(found.farthest_sign[drive]) == int(shared[move.norm(dim=1).argmax()])
         cost = torch.einsum("ni,nij,nj->n", move, covariance[shared].inverse(), move) / 3
         assert float(found.in_sigmas[drive]) == pytest.approx(float(cost.mean().sqrt()))
-        move = (whole.step(without=[drive])["lane"] - whole.step()["lane"]).double()
+        move = (step(whole, drive)["lane"] - step(whole)["lane"]).double()
         across = torch.einsum("ck,ck->c", move, bundle.lane_axes[..., 1])
         others = [one.block["lane"] for n, one in enumerate(whole.of_drives) if n != drive]
         seen = whole.of_drives[drive].block["lane"]
@@ -111,6 +118,13 @@ def test_who_has_no_say_has_no_influence(street, every):
     found = influence(bundle, torch.eye(3).double().expand(len(street.signs), 3, 3))
     assert torch.isnan(found.in_sigmas).tolist() == [n == 0 for n in every]
     assert int(found.farthest_sign[0]) == -1 and int(found.alone[0]) == 0
+
+
+def test_a_map_that_cannot_be_solved_without_a_drive_has_no_figures(street, bundle, monkeypatch):
+    covariance = torch.eye(3).double().expand(len(street.signs), 3, 3)
+    monkeypatch.setattr(TiledCholesky, "of", lambda matrix: None)
+    found = influence(bundle, covariance)
+    assert found.in_sigmas.isnan().all() and found.across_m.isnan().all()
 
 
 def test_hosts_tell_the_same(street, bundle):

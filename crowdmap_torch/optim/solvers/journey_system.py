@@ -350,11 +350,11 @@ class MapSystem:
         """The members'."""
         return self.systems[1:]
 
-    def step(self, *, without: Collection[int] = ()) -> dict[str, Tensor]:
+    def step(self, *, without: Collection[int] = ()) -> dict[str, Tensor] | None:
         """The step to the least cost of all but some members, numbered from 0, by variable; of what is common to all.
 
-        Landmarks that nobody else saw stay where what is known without any drive holds them. ValueError: the sum is not
-        positive definite.
+        Landmarks that nobody else saw stay where what is known without any drive holds them. None: the sum is not positive
+        definite.
         """
         systems = [one for n, one in enumerate(self.systems) if n - 1 not in without or not n]
         present = _with_tiles(self.pattern, (one.tile for one in systems))
@@ -366,7 +366,7 @@ class MapSystem:
         right_side = total.right_side[:, None].clone()
         factor = TiledCholesky.of(total)
         if factor is None:
-            raise ValueError("the normal equations of the map are not positive definite")
+            return None
         return self.where.unpack(-factor.solve(right_side)[None, :, 0])
 
 
