@@ -57,9 +57,9 @@ from crowdmap_torch.processes.together import Together
 class JourneySystem:
     """What some drives say of the map at one point: one summand of its normal equations."""
 
-    block: Mapping[str, Int[Tensor, " n"]]
+    block: Mapping[str, Int[Tensor, " _"]]
     """By variable the rows of the landmarks that it says something of, and of blocks of the border."""
-    point: Mapping[str, Float[Tensor, "n ..."]]
+    point: Values
     """Where these are: what it says holds there."""
     cost: Float[Tensor, " 1"]
     """Of what is the drives' own, there."""
