@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.noise.leaps import HARDEST_MPS2
+from crowdmap_torch.noise.leaps import beyond_brakes
 from crowdmap_torch.optim.banded_least_squares import solve_banded
 from crowdmap_torch.optim.robust import median_along
 from crowdmap_torch.processes.sums import running_sum
@@ -34,17 +34,13 @@ _AT_ONCE_S = 0.005
 """Frames closer together than this are taken to be so far apart."""
 
 
-def _noise(position: Float[Tensor, "f 3"], t_ns: Int[Tensor, " f"]) -> Float[Tensor, " f"]:
-    """1-sigma of positions along each axis [m] where they jump as no car does and six times as much as usual, else zero."""
-    noise = torch.zeros_like(position[:, 0])
-    step = position.diff(dim=0)
-    if len(step) <= 2 * _HALF_WINDOW + 1:
-        return noise
+def _noise(
+    step: Float[Tensor, "s 3"], t_ns: Int[Tensor, " f"], usual: Float[Tensor, ""]
+) -> Float[Tensor, " f"]:
+    """1-sigma of positions along each axis [m] where they jump as no car does and far more than is `usual`, else zero."""
+    noise = step.new_zeros(len(t_ns))
     seconds = t_ns.diff().to(step) * 1e-9
-    between = (seconds[1:] + seconds[:-1]) / 2
-    changes = (step / seconds[:, None]).diff(dim=0).norm(dim=1)
-    beyond = (changes - HARDEST_MPS2 * between).clamp_min(0) * between
-    usual = median_along(step.diff(dim=0).norm(dim=1), 0)
+    beyond = beyond_brakes(step, seconds) * (seconds[1:] + seconds[:-1]) / 2
     there = median_along(beyond.unfold(0, 2 * _HALF_WINDOW + 1, 1), 1)
     there = _wider(torch.where(there > (_OF_USUAL * usual).clamp_min(_LEAST_M), there, 0))
     # Where noise begins and ends few of a window are noisy.
@@ -63,12 +59,15 @@ def without_bursts(
 ) -> tuple[Float[Tensor, "f 4 4"], int]:
     """The poses of a drive with smooth positions where they are noisy for a while, and in how many frames they were."""
     position = T[:, :3, 3]
-    noise = _noise(position, t_ns)
+    step = position.diff(dim=0)
+    if len(step) <= 2 * _HALF_WINDOW + 1:
+        return T, 0
+    usual = median_along(step.diff(dim=0).norm(dim=1), 0)
+    noise = _noise(step, t_ns, usual)
     noisy = noise > 0
     if not bool(noisy.any()):
         return T, 0
-    usual = median_along(position.diff(dim=0).diff(dim=0).norm(dim=1), 0) / _CHANGE_OF_NOISE
-    sigma = torch.maximum(noise, usual + _SURE_M)
+    sigma = torch.maximum(noise, usual / _CHANGE_OF_NOISE + _SURE_M)
     t = running_sum((t_ns.diff().to(T) * 1e-9).clamp_min(_AT_ONCE_S))
     t = torch.cat((torch.zeros_like(t[:1]), t))
     at = torch.stack([t[k : len(t) - 3 + k] for k in range(4)], dim=1)

@@ -15,7 +15,7 @@ from crowdmap_torch.processes.sums import running_sum
 
 _FASTEST_MPS = 70.0
 """Speed that no car exceeds."""
-HARDEST_MPS2 = 12.0
+_HARDEST_MPS2 = 12.0
 """Acceleration that no car exceeds."""
 _LEAST_M = 0.5
 """Shorter leaps are left where they are: drift goes as far within some frames."""
@@ -51,12 +51,15 @@ def _beyond_driving(position: Float[Tensor, "f 3"], t_ns: Int[Tensor, " f"]) -> 
     seconds = t_ns.diff().to(step) * 1e-9
     if len(step) < 2:
         return (step.norm(dim=1) - _FASTEST_MPS * seconds).clamp_min(0)
-    velocity = step / seconds[:, None]
-    # The speed of a step is that of its middle: from there to the next step's middle it may change.
-    change = HARDEST_MPS2 * (seconds[1:] + seconds[:-1]) / 2
-    faster = (velocity.diff(dim=0).norm(dim=1) - change).clamp_min(0)
-    by_time = _against_both(faster) * seconds
+    by_time = _against_both(beyond_brakes(step, seconds)) * seconds
     return torch.minimum(by_time, _against_both(step.diff(dim=0).norm(dim=1)))
+
+
+def beyond_brakes(step: Float[Tensor, "s 3"], seconds: Float[Tensor, " s"]) -> Float[Tensor, " c"]:
+    """How much more the velocity changes from each step to the next than a car's brakes and tyres can do [m/s]."""
+    # The speed of a step is that of its middle: from there to the next step's middle it may change.
+    change = _HARDEST_MPS2 * (seconds[1:] + seconds[:-1]) / 2
+    return ((step / seconds[:, None]).diff(dim=0).norm(dim=1) - change).clamp_min(0)
 
 
 def _against_both(change: Float[Tensor, " f"]) -> Float[Tensor, " g"]:
@@ -83,7 +86,7 @@ def _goes_on(
     change = (median_along(behind, 1) - median_along(before, 1)).norm(dim=-1)
     # From the middle of those before to the middle of those behind.
     between = (_HALF_WINDOW + 1) * seconds[at]
-    brakes = HARDEST_MPS2 * seconds[at] * between
+    brakes = _HARDEST_MPS2 * seconds[at] * between
     return (turn < _LOOKS_ON_RAD + _TURNS_RADPS * seconds[at]) & (
         change < brakes + _OF_NOISE * usual
     )

@@ -258,7 +258,8 @@ class JourneyEquations:
         own = self.own
 
         def of_all(parts: Iterator[JourneySystem]) -> MapSystem:
-            return MapSystem(own.structure.where, own.structure.reduced, tuple(parts))
+            layout = own.structure.where, own.structure.reduced
+            return MapSystem(*layout, self.values, tuple(parts))
 
         return self.together.for_leader(
             of_all, self._system(torch.zeros_like(own.eliminated_gradient))
@@ -342,6 +343,8 @@ class MapSystem:
     where: Layout
     pattern: TilePattern
     """Of the landmarks' grid, whichever tiles it has."""
+    values: Values
+    """The point."""
     systems: tuple[JourneySystem, ...]
     """The leader's, of what is known without any drive, then one for each member."""
 
@@ -357,17 +360,11 @@ class MapSystem:
         definite.
         """
         systems = [one for n, one in enumerate(self.systems) if n - 1 not in without or not n]
-        present = _with_tiles(self.pattern, (one.tile for one in systems))
-        total = TileMatrix.zeros(_filled(self.pattern, present), systems[0].information)
-        for one in systems:
-            one.add_to(total)
-        gaps = self.where.gaps
-        total.add_diagonal(torch.where(gaps, 1.0, UNOBSERVED_FLOOR).to(total.flat))
-        right_side = total.right_side[:, None].clone()
-        factor = TiledCholesky.of(total)
-        if factor is None:
-            return None
-        return self.where.unpack(-factor.solve(right_side)[None, :, 0])
+        present, like = _with_tiles(self.pattern, (one.tile for one in systems)), self.systems[0]
+        summed = Summed(TileMatrix.zeros(_filled(self.pattern, present), like.information))
+        added = torch.where(self.where.gaps, 1.0, UNOBSERVED_FLOOR).to(like.information)
+        right_side = summed.factorise(added, iter(systems), self.values)
+        return None if right_side is None else self.where.unpack(-summed.solve(right_side)[None])
 
 
 def _with_tiles(pattern: TilePattern, tiles: Iterator[Int[Tensor, "n 2"]]) -> Bool[Tensor, "t t"]:
