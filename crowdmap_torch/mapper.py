@@ -19,6 +19,7 @@ from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
 from crowdmap_torch.adjustment.detection_lanes import with_lanes
 from crowdmap_torch.adjustment.footing import Footing, footing_of
+from crowdmap_torch.adjustment.witnesses import witnesses
 from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
 from crowdmap_torch.crowd_lanes.join import join_lanes
@@ -178,11 +179,9 @@ def map_journeys(
 ) -> tuple[JourneyMap, ...]:
     """Section IV for every journey, by the workers of an engine (None: in this process), each on one core.
 
-    The result depends neither on the engine nor on its workers. Those read the journeys themselves where these are `stored`,
-    else they are handed over; drives on a GPU stay in this process. Those that are `known`, by number, are taken as they
-    are; of others the `tracklets` that sign detections are associated to may be known. `keep` is handed those that were
-    mapped with their numbers, as soon as each is there. ChildProcessError, with the journey's name, if the worker of a
-    journey is killed again and again.
+    Any engine with any number of workers makes the same, and they read journeys that are `stored` themselves; drives on a
+    GPU stay in this process. Those `known`, by number, are taken as they are, and so are `tracklets` of sign detections.
+    `keep` is handed each that was mapped. ChildProcessError, with its name, if the worker of one is killed again and again.
     """
     stage, total, maps = "single journeys", len(journeys), dict(known or {})
     progress(stage, len(maps), total)
@@ -356,23 +355,24 @@ def made_anew(
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
     """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: none did.
 
-    Markers that are there twice are joined anew. With it the covariances, if they had to be known for that.
+    None is what went astray, or fits too few drives. Markers that are there twice are joined anew. With it the covariances,
+    if they had to be known for that.
     """
     rules = config.duplicate_signs
     if first.completed is None or first.anew >= rules.rounds:
         return None, None
-    signs, lanes = adjust.read_map(bundle, first.signs, first.lanes)
-    poses, crowd = adjust.read_poses(bundle, journeys), first.crowd
+    (signs, lanes), crowd = adjust.read_map(bundle, first.signs, first.lanes), first.crowd
+    poses, sound = adjust.read_poses(bundle, journeys), crowd.journey_weight > 0
     drifts = tuple(map(se3.local, (j.T_world_camera for j in journeys), poses))
     markers = lanes, [m.lanes for m in maps], drifts, crowd.trusted_frames(journeys)
     joined, known = joined_anew(*markers, crowd.positioning, config.lane_join), None
     found = AssociatedSigns(signs, first.tentative, first.associations, first.completed)
-    once = without_strayed(found, first.signs, journeys, first.drifts, drifts, rules)
+    unseen = witnesses(bundle, sound) < min(config.crowd.min_journeys, len(journeys))
+    once = without_strayed(found, first.signs, journeys, first.drifts, drifts, unseen, rules)
     if once is None and len(may_be_one(signs, journeys, first.associations, rules)):
         known = map_uncertainty(bundle, first.signs, first.lanes, engine)
         found = replace(found, heads=replace(signs, covariance=known.of_their_own))
         given = journeys, poses, [m.sign_tracklets for m in maps], found, rules
-        sound = crowd.journey_weight > 0
         once = associated_once(*given, config.complete_tracks, trusted=sound)
     if joined is None and once is None:
         return None, known

@@ -23,6 +23,7 @@ from crowdmap_torch.crowd_signs.duplicates import (
     gone_astray,
     same_sign,
 )
+from crowdmap_torch.crowd_signs.evidence import of_its_shape, of_trusted, seen_by
 from crowdmap_torch.crowd_signs.existence import existence, still_alone
 from crowdmap_torch.crowd_signs.projections import (
     Candidates,
@@ -134,7 +135,9 @@ def with_vouched(
         for k, (journey, pose, made, seen) in enumerate(drives)
     )
     every = with_evidence(every, journeys, shown, trusted, completion)
-    vouched = every.n_journeys[n:] >= config.min_journeys
+    # What is drawn as another shape is as likely another sign, or none, that lies before or behind it.
+    alike = [of_its_shape(a, j, every) for a, j in zip(shown, journeys, strict=True)]
+    vouched = seen_by(alike, len(every), trusted, completion)[n:] >= config.min_journeys
     if not bool(vouched.any()):
         return found
     sure = existence(every.n_journeys[n:], passing, config.existence).to(heads.size)
@@ -265,15 +268,17 @@ def without_strayed(
     journeys: Sequence[Journey],
     begun: Sequence[Float[Tensor, "_ 6"]],
     ended: Sequence[Float[Tensor, "_ 6"]],
+    unseen: Bool[Tensor, " n"],
     config: DuplicateSignConfig,
 ) -> AssociatedSigns | None:
-    """What is `after` an adjustment without the heads that have `gone_astray` in it; None if none did."""
+    """What is `after` an adjustment without the heads that have `gone_astray` in it or are `unseen`; None if none is."""
     strayed = gone_astray(before, after.heads, journeys, after.associations, begun, ended, config)
-    if not bool(strayed.any()) or after.completed is None:
+    goes = strayed | unseen
+    if not bool(goes.any()) or after.completed is None:
         return None
-    associations = without_signs(after.associations, strayed)
+    associations = without_signs(after.associations, goes)
     completed = replace(after.completed, associations=associations)
-    return AssociatedSigns(after.heads[~strayed], after.tentative, associations, completed)
+    return AssociatedSigns(after.heads[~goes], after.tentative, associations, completed)
 
 
 def join_duplicates(
@@ -329,20 +334,16 @@ def with_evidence(
 
     Only journeys that are `trusted` count.
     """
-    number = torch.arange(len(journeys), device=signs.shape.device)
-    size = torch.tensor([len(a.sign) for a in associations], device=number.device)
-    journey = torch.repeat_interleave(number, size)
-    label = torch.cat([a.sign for a in associations])
-    t_ns = torch.cat([j.t_ns[j.signs.frame] for j in journeys])
-    used = (label >= 0) & trusted[journey]
-    label, t_ns = label[used], t_ns[used]
-    owner, _, views = distinct_pairs(label, journey[used])
+    label = [a.sign for a in associations]
+    used, _ = of_trusted(label, trusted)
+    shown = torch.cat(label)[used]
+    t_ns = torch.cat([j.t_ns[j.signs.frame] for j in journeys])[used]
     return replace(
         signs,
-        n_journeys=group_count(owner[views >= config.evidence], len(signs)),
-        n_observations=group_count(label, len(signs)),
-        first_seen_ns=signs.first_seen_ns.scatter_reduce(0, label, t_ns, "amin"),
-        last_seen_ns=signs.last_seen_ns.scatter_reduce(0, label, t_ns, "amax"),
+        n_journeys=seen_by(label, len(signs), trusted, config),
+        n_observations=group_count(shown, len(signs)),
+        first_seen_ns=signs.first_seen_ns.scatter_reduce(0, shown, t_ns, "amin"),
+        last_seen_ns=signs.last_seen_ns.scatter_reduce(0, shown, t_ns, "amax"),
     )
 
 

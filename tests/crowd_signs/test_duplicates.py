@@ -206,10 +206,13 @@ def test_signs_go_astray_beside_the_cameras_that_saw_them(
     begun, risen = torch.zeros(len(given), 6, dtype=F64), given.clone()
     risen[:, 2, 3] += of_cameras_m
     drifts = [begun], [se3.local(given, risen)]
-    found = without_strayed(after, before, [drive.journey], *drifts, CONFIG)
+    seen = torch.zeros(len(PLACES), dtype=torch.bool)
+    unseen = torch.tensor([False, True, False])
+    found = without_strayed(after, before, [drive.journey], *drifts, seen, CONFIG)
     if not astray:
         assert found is None
-        return
+        # But what too few saw is none wherever it stands.
+        found = without_strayed(after, before, [drive.journey], *drifts, unseen, CONFIG)
     assert found is not None and len(found.heads) == len(PLACES) - 1
     assert torch.equal(found.heads.T_world_sign, moved[[0, 2]])
     number = torch.tensor([0, -1, 1])
