@@ -264,9 +264,8 @@ def first_map(
         clusters = cluster_lanes(pieces, config.lane_cluster, generator=generator)
         lanes, rounds = clusters.heads, clusters.rounds
         support = support_of_pieces(pieces, clusters.label, config.lane_join.sample_spacing_m)
-    found = associate_detections(
-        journeys, poses, tracklets, crowd, config.crowd, config.complete_tracks
-    )
+    rules = config.crowd, config.complete_tracks
+    found = associate_detections(journeys, poses, tracklets, crowd, *rules)
     return FirstMap(
         signs=found.heads,
         lanes=lanes,
@@ -355,8 +354,8 @@ def made_anew(
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
     """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: none did.
 
-    None is what went astray, or fits too few drives. Markers that are there twice are joined anew. With it the covariances,
-    if they had to be known for that.
+    None is what went astray, fits too few drives or is another one from afar. Markers that are there twice are joined anew.
+    With it the covariances, if they had to be known for that.
     """
     rules = config.duplicate_signs
     if first.completed is None or first.anew >= rules.rounds:
@@ -368,7 +367,8 @@ def made_anew(
     joined, known = joined_anew(*markers, crowd.positioning, config.lane_join), None
     found = AssociatedSigns(signs, first.tentative, first.associations, first.completed)
     unseen = witnesses(bundle, sound) < min(config.crowd.min_journeys, len(journeys))
-    once = without_strayed(found, first.signs, journeys, first.drifts, drifts, unseen, rules)
+    way = journeys, first.drifts, drifts, unseen
+    once = without_strayed(found, first.signs, *way, rules, config.complete_tracks)
     if once is None and len(may_be_one(signs, journeys, first.associations, rules)):
         known = map_uncertainty(bundle, first.signs, first.lanes, engine)
         found = replace(found, heads=replace(signs, covariance=known.of_their_own))

@@ -20,8 +20,8 @@ from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.duplicates import (
     DuplicateSignConfig,
     duplicate_signs,
-    gone_astray,
     same_sign,
+    shown_as_none,
 )
 from crowdmap_torch.crowd_signs.evidence import of_its_shape, of_trusted, seen_by
 from crowdmap_torch.crowd_signs.existence import existence, still_alone
@@ -256,8 +256,9 @@ def associated_once(
     joined = join_duplicates(before.heads, journeys, before.associations, config)
     if joined is None:
         return None
-    given = journeys, poses, tracklets
-    heads, completed = completed_signs(*given, *joined, completion, trusted=trusted)
+    heads, completed = completed_signs(
+        journeys, poses, tracklets, *joined, completion, trusted=trusted
+    )
     alone = still_alone(before.tentative, tracklets, completed.associations)
     return AssociatedSigns(heads, before.tentative[alone], completed.associations, completed)
 
@@ -270,10 +271,11 @@ def without_strayed(
     ended: Sequence[Float[Tensor, "_ 6"]],
     unseen: Bool[Tensor, " n"],
     config: DuplicateSignConfig,
+    completion: CompleteTracksConfig,
 ) -> AssociatedSigns | None:
-    """What is `after` an adjustment without the heads that have `gone_astray` in it or are `unseen`; None if none is."""
-    strayed = gone_astray(before, after.heads, journeys, after.associations, begun, ended, config)
-    goes = strayed | unseen
+    """What is `after` an adjustment without the heads that are none by it (`shown_as_none`) or `unseen`; None if none is."""
+    given = before, after.heads, journeys, after.associations
+    goes = unseen | shown_as_none(*given, begun, ended, config, completion)
     if not bool(goes.any()) or after.completed is None:
         return None
     associations = without_signs(after.associations, goes)
@@ -330,10 +332,7 @@ def with_evidence(
     trusted: Bool[Tensor, " j"],
     config: CompleteTracksConfig,
 ) -> Signs:
-    """The signs with how often, by how many journeys and when they were seen, from the detections that show them.
-
-    Only journeys that are `trusted` count.
-    """
+    """The signs with how often, by how many `trusted` journeys and when they were seen, from the detections of those."""
     label = [a.sign for a in associations]
     used, _ = of_trusted(label, trusted)
     shown = torch.cat(label)[used]

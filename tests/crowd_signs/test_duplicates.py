@@ -17,6 +17,7 @@ from worlds.sign_drive import (
     signs_at,
     straight_poses,
     two_journeys,
+    with_rows,
 )
 
 from crowdmap_torch.crowd_signs.complete_tracks import (
@@ -25,11 +26,12 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     join_duplicates,
     without_strayed,
 )
+from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, may_be_one, seen_together
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.tables import Association, Journey, Signs
 
-CONFIG = DuplicateSignConfig()
+CONFIG, COMPLETION = DuplicateSignConfig(), CompleteTracksConfig()
 PLACES = [(4.0, 60.0, 3.0), (4.0, 60.0, 2.3), (-5.0, 75.0, 2.8)]
 """Two signs on one post, 0.7 m apart, and one across the road."""
 
@@ -208,14 +210,49 @@ def test_signs_go_astray_beside_the_cameras_that_saw_them(
     drifts = [begun], [se3.local(given, risen)]
     seen = torch.zeros(len(PLACES), dtype=torch.bool)
     unseen = torch.tensor([False, True, False])
-    found = without_strayed(after, before, [drive.journey], *drifts, seen, CONFIG)
+    found = without_strayed(after, before, [drive.journey], *drifts, seen, CONFIG, COMPLETION)
     if not astray:
         assert found is None
         # But what too few saw is none wherever it stands.
-        found = without_strayed(after, before, [drive.journey], *drifts, unseen, CONFIG)
+        found = without_strayed(after, before, [drive.journey], *drifts, unseen, CONFIG, COMPLETION)
     assert found is not None and len(found.heads) == len(PLACES) - 1
     assert torch.equal(found.heads.T_world_sign, moved[[0, 2]])
     number = torch.tensor([0, -1, 1])
     assert torch.equal(found.associations[0].sign, number[association.sign])
     assert found.completed is not None
     assert torch.equal(found.completed.associations[0].sign, number[association.sign])
+
+
+@pytest.mark.parametrize("fault", ["", "to the side", "too far", "beside it"])
+def test_a_sign_seen_from_afar_alone_is_the_one_behind_it(fault: str):
+    """From 80 m a metre along the ray is less than a pixel: a second one there, that no other drive saw."""
+    off = {"to the side": (1.5, 0.0, 0.0), "too far": (0.0, 8.0, 0.0)}.get(fault, (0.0, 3.0, 0.0))
+    drive = drive_past(straight_poses(80), signs_at([(4.0 + off[0], 90.0, 3.0)]))
+    rays = drive.journey.T_world_camera[:, :3, 3]
+    distance = (rays[drive.journey.signs.frame] - drive.T_world_sign[0, :3, 3]).norm(dim=1)
+    far = distance > 60
+    if fault == "beside it":
+        # Frames in which the same drive has the other one too, it has two of them.
+        drive = with_rows(drive, torch.cat((torch.arange(len(far)), torch.nonzero(far)[:, 0])))
+        second = torch.cat((drive.sign[: len(far)], torch.ones_like(drive.sign[len(far) :])))
+    else:
+        drive, second = with_rows(drive, torch.nonzero(far)[:, 0]), torch.ones(int(far.sum()))
+        second = second.long()
+    first = drive_past(straight_poses(80), signs_at([(4.0, 90.0, 3.0)]))
+    journeys = [first.journey, first.journey, drive.journey]
+    shown = [first.sign, first.sign, second]
+    none = torch.zeros(0, dtype=torch.int64)
+    associations = [Association(s, torch.zeros_like(s), none) for s in shown]
+    heads = with_copy(map_of(first), 0, off)
+    heads = replace(heads, n_journeys=torch.tensor([2, 1]))
+    completed = CompletedTracks(tuple(associations), 0, 0)
+    after = AssociatedSigns(heads, heads[:0], tuple(associations), completed)
+    nothing = [torch.zeros(len(j.T_world_camera), 6, dtype=F64) for j in journeys]
+    unseen = torch.zeros(2, dtype=torch.bool)
+    found = without_strayed(after, heads, journeys, nothing, nothing, unseen, CONFIG, COMPLETION)
+    if fault:
+        assert found is None
+    else:
+        assert found is not None and len(found.heads) == 1
+        assert torch.equal(found.heads.T_world_sign, heads.T_world_sign[:1])
+        assert bool((found.associations[2].sign == -1).all())
