@@ -328,14 +328,13 @@ def adjusted_map(
     progress: ProgressCall = silent,
 ) -> MapResult:
     """Section V-B: the `first` map adjusted, and once more where signs turned out to be one."""
-    journeys = dataset.journeys
     while True:
-        bundle = build_bundle(journeys, maps, first, config, control=control)
+        bundle = build_bundle(dataset.journeys, maps, first, config, control=control)
         state = begun = adjust.start(bundle)
         for iteration, after, _ in adjust.steps(bundle, begun, engine=engine):
             state = after
             progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
-        again, known = made_anew(journeys, maps, first, bundle, config, engine)
+        again, known = made_anew(dataset.journeys, maps, first, bundle, config, engine)
         if again is None:
             return finish_map(dataset, maps, first, bundle, state, config, engine, known)
         first = again
@@ -354,8 +353,8 @@ def made_anew(
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
     """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: none did.
 
-    None is what went astray, fits too few drives or is another one from afar. Markers that are there twice are joined anew.
-    With it the covariances, if they had to be known for that.
+    None is what went astray, is another one from afar, or fits too few drives and is none of two that may be one. Markers
+    that are there twice are joined anew. With it the covariances, if they had to be known for that.
     """
     rules = config.duplicate_signs
     if first.completed is None or first.anew >= rules.rounds:
@@ -366,14 +365,15 @@ def made_anew(
     markers = lanes, [m.lanes for m in maps], drifts, crowd.trusted_frames(journeys)
     joined, known = joined_anew(*markers, crowd.positioning, config.lane_join), None
     found = AssociatedSigns(signs, first.tentative, first.associations, first.completed)
+    pair = may_be_one(signs, journeys, first.associations, rules)
     unseen = witnesses(bundle, sound) < min(config.crowd.min_journeys, len(journeys))
-    way = journeys, first.drifts, drifts, unseen
-    once = without_strayed(found, first.signs, *way, rules, config.complete_tracks)
-    if once is None and len(may_be_one(signs, journeys, first.associations, rules)):
+    given = journeys, poses, [m.sign_tracklets for m in maps]
+    how = rules, config.complete_tracks, sound
+    once = without_strayed(*given, found, first.signs, first.drifts, drifts, unseen, pair, *how)
+    if once is None and len(pair):
         known = map_uncertainty(bundle, first.signs, first.lanes, engine)
         found = replace(found, heads=replace(signs, covariance=known.of_their_own))
-        given = journeys, poses, [m.sign_tracklets for m in maps], found, rules
-        once = associated_once(*given, config.complete_tracks, trusted=sound)
+        once = associated_once(*given, found, *how)
     if joined is None and once is None:
         return None, known
     found = once or found

@@ -15,19 +15,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.clustering.assignment import match_slots
-from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_count
+from crowdmap_torch.clustering.groups import cheapest, group_count
 from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.duplicates import (
     DuplicateSignConfig,
     duplicate_signs,
+    gone_astray,
     same_sign,
-    shown_as_none,
 )
-from crowdmap_torch.crowd_signs.evidence import of_its_shape, of_trusted, seen_by
+from crowdmap_torch.crowd_signs.evidence import of_its_shape, of_trusted, seen_by, tracklet_votes
 from crowdmap_torch.crowd_signs.existence import existence, still_alone
 from crowdmap_torch.crowd_signs.projections import (
     Candidates,
-    ProjectionErrors,
     box,
     candidates_nearby,
     misfit_px,
@@ -36,9 +35,6 @@ from crowdmap_torch.crowd_signs.projections import (
 from crowdmap_torch.crowd_signs.register import Crowd, CrowdConfig
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.tables import Association, Journey, Signs, Tracklets, concatenate
-
-_USUAL = 2.0
-"""Hardly any detection is farther off its sign than so many times what half of them are."""
 
 
 @dataclass(frozen=True)
@@ -246,7 +242,6 @@ def associated_once(
     before: AssociatedSigns,
     config: DuplicateSignConfig,
     completion: CompleteTracksConfig,
-    *,
     trusted: Bool[Tensor, " j"],
 ) -> AssociatedSigns | None:
     """What is `before` with those signs joined that are one, and with what else shows them by now; None if none are.
@@ -256,31 +251,37 @@ def associated_once(
     joined = join_duplicates(before.heads, journeys, before.associations, config)
     if joined is None:
         return None
-    heads, completed = completed_signs(
-        journeys, poses, tracklets, *joined, completion, trusted=trusted
-    )
-    alone = still_alone(before.tentative, tracklets, completed.associations)
-    return AssociatedSigns(heads, before.tentative[alone], completed.associations, completed)
+    given = journeys, poses, tracklets, *joined
+    return _associated_anew(*given, before.tentative, completion, trusted)
 
 
 def without_strayed(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    tracklets: Sequence[Tracklets],
     after: AssociatedSigns,
     before: Signs,
-    journeys: Sequence[Journey],
     begun: Sequence[Float[Tensor, "_ 6"]],
     ended: Sequence[Float[Tensor, "_ 6"]],
     unseen: Bool[Tensor, " n"],
+    pair: Int[Tensor, "p 2"],
     config: DuplicateSignConfig,
     completion: CompleteTracksConfig,
+    trusted: Bool[Tensor, " j"],
 ) -> AssociatedSigns | None:
-    """What is `after` an adjustment without the heads that are none by it (`shown_as_none`) or `unseen`; None if none is."""
-    given = before, after.heads, journeys, after.associations
-    goes = unseen | shown_as_none(*given, begun, ended, config, completion)
-    if not bool(goes.any()) or after.completed is None:
+    """What is `after` an adjustment without the heads that it shows to be none, and with what else shows the others.
+
+    They have `gone_astray`, are `unseen` or, by the adjusted poses, `duplicate_signs`, as far apart as rays from afar leave
+    open; of a `pair` that may be one both stay. None if all do.
+    """
+    astray = gone_astray(before, after.heads, journeys, after.associations, begun, ended, config)
+    far = replace(completion, duplicate_m=config.hidden_m)
+    hidden = duplicate_signs(journeys, poses, after.heads, after.associations, far)
+    goes = astray | (unseen | hidden).index_fill(0, pair.flatten(), False)
+    if not bool(goes.any()):
         return None
-    associations = without_signs(after.associations, goes)
-    completed = replace(after.completed, associations=associations)
-    return AssociatedSigns(after.heads[~goes], after.tentative, associations, completed)
+    left = after.heads[~goes], without_signs(after.associations, goes)
+    return _associated_anew(journeys, poses, tracklets, *left, after.tentative, completion, trusted)
 
 
 def join_duplicates(
@@ -310,21 +311,6 @@ def without_signs(
     return tuple(replace(a, sign=number[a.sign]) for a in associations)
 
 
-def _shown_by(
-    association: Association,
-    into: Int[Tensor, " n"],
-    turn: Int[Tensor, " n"],
-    count: Int[Tensor, " n"],
-) -> Association:
-    """The association with the signs that others went into, its corners turned against those."""
-    rows = torch.nonzero(association.sign >= 0)[:, 0]
-    sign, shift = association.sign.clone(), association.sign_shift.clone()
-    before = sign[rows]
-    sign[rows] = into[before]
-    shift[rows] = (turn[before] + shift[rows]) % count[before]
-    return replace(association, sign=sign, sign_shift=shift)
-
-
 def with_evidence(
     signs: Signs,
     journeys: Sequence[Journey],
@@ -344,6 +330,37 @@ def with_evidence(
         first_seen_ns=signs.first_seen_ns.scatter_reduce(0, shown, t_ns, "amin"),
         last_seen_ns=signs.last_seen_ns.scatter_reduce(0, shown, t_ns, "amax"),
     )
+
+
+def _associated_anew(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    tracklets: Sequence[Tracklets],
+    heads: Signs,
+    associations: Sequence[Association],
+    tentative: Signs,
+    completion: CompleteTracksConfig,
+    trusted: Bool[Tensor, " j"],
+) -> AssociatedSigns:
+    given = journeys, poses, tracklets, heads, associations
+    heads, completed = completed_signs(*given, completion, trusted=trusted)
+    alone = still_alone(tentative, tracklets, completed.associations)
+    return AssociatedSigns(heads, tentative[alone], completed.associations, completed)
+
+
+def _shown_by(
+    association: Association,
+    into: Int[Tensor, " n"],
+    turn: Int[Tensor, " n"],
+    count: Int[Tensor, " n"],
+) -> Association:
+    """The association with the signs that others went into, its corners turned against those."""
+    rows = torch.nonzero(association.sign >= 0)[:, 0]
+    sign, shift = association.sign.clone(), association.sign_shift.clone()
+    before = sign[rows]
+    sign[rows] = into[before]
+    shift[rows] = (turn[before] + shift[rows]) % count[before]
+    return replace(association, sign=sign, sign_shift=shift)
 
 
 def _with_fitting(
@@ -367,41 +384,10 @@ def _with_fitting(
         limit = config.known_px + config.known_share * pairs.size
         known = misfit.masked_fill(~error.is_known | (misfit > limit), torch.inf)
         _, target = cheapest(pairs.row, pairs.sign, known, len(association.sign))
-        voted = _tracklet_votes(tracklets, pairs, misfit, error, len(target), config)
+        voted = tracklet_votes(tracklets, pairs, misfit, error, len(target), config)
         target = torch.where(target < 0, voted, target)
         association = _with_signs(association, target, pairs, shift)
     return association
-
-
-def _tracklet_votes(
-    tracklets: Tracklets,
-    pairs: Candidates,
-    misfit: Float[Tensor, " p"],
-    error: ProjectionErrors,
-    rows: int,
-    config: CompleteTracksConfig,
-) -> Int[Tensor, " d"]:
-    """The sign that most detections of a tracklet lie on, for those that do; -1 for the others."""
-    # Where images are noisy most are farther off than `known_px`.
-    known_px = (_USUAL * error.usual_px).clamp_min(config.known_px)
-    limit = config.vote_share * pairs.size
-    limit = torch.where(error.is_known, known_px + config.known_share * pairs.size, limit)
-    best, sign = cheapest(pairs.row, pairs.sign, misfit, rows)
-    other = pairs.sign != sign[pairs.row]
-    second, _ = cheapest(pairs.row[other], pairs.sign[other], misfit[other], rows)
-    chosen = pairs.sign == sign[pairs.row]
-    inside = torch.zeros(rows, dtype=torch.bool, device=sign.device)
-    inside[pairs.row[chosen & (misfit < limit)]] = True
-    inside &= config.vote_clear * best < second
-    label = tracklets.label
-    voting = inside & (label >= 0)
-    owner, target, votes = distinct_pairs(label[voting], sign[voting])
-    size = group_count(label, tracklets.count)[owner]
-    wins = (votes >= config.vote_majority * size) & (votes >= config.vote_detections)
-    of_tracklet = torch.full((tracklets.count + 1,), -1, dtype=label.dtype, device=label.device)
-    of_tracklet[owner[wins]] = target[wins]
-    winner = of_tracklet[label]  # label -1 reads the last slot, which stays -1
-    return torch.where(inside & (sign == winner), sign, -1)
 
 
 def _with_displaced(

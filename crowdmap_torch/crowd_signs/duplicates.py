@@ -7,7 +7,7 @@ adjustment, which sees all rays at once, brings them to one place.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -99,27 +99,6 @@ def duplicate_signs(
     duplicate = torch.zeros(n, dtype=torch.bool, device=weaker.device)
     duplicate[weaker[~is_first]] = True
     return duplicate
-
-
-def shown_as_none(
-    before: Signs,
-    after: Signs,
-    journeys: Sequence[Journey],
-    associations: Sequence[Association],
-    begun: Sequence[Float[Tensor, "_ 6"]],
-    ended: Sequence[Float[Tensor, "_ 6"]],
-    config: DuplicateSignConfig,
-    completion: CompleteTracksConfig,
-) -> Bool[Tensor, " n"]:
-    """True for signs that an adjustment shows to be none, by their rows `before` and `after` it.
-
-    They have `gone_astray`, or are `duplicate_signs` by the adjusted poses, as far apart as rays from afar leave open.
-    """
-    astray = gone_astray(before, after, journeys, associations, begun, ended, config)
-    given = (journey.T_world_camera for journey in journeys)
-    poses = [se3.retract(*pair) for pair in zip(given, ended, strict=True)]
-    hidden = replace(completion, duplicate_m=config.hidden_m)
-    return astray | duplicate_signs(journeys, poses, after, associations, hidden)
 
 
 def gone_astray(

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import distinct_pairs, group_count
+from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_count
 from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
-from crowdmap_torch.tables import Association, Journey, Signs
+from crowdmap_torch.crowd_signs.projections import Candidates, ProjectionErrors
+from crowdmap_torch.tables import Association, Journey, Signs, Tracklets
+
+_USUAL = 2.0
+"""Hardly any detection is farther off its sign than so many times what half of them are."""
 
 
 def seen_by(
@@ -40,3 +44,34 @@ def of_trusted(
     journey = torch.repeat_interleave(torch.arange(len(label), device=trusted.device), size)
     used = torch.nonzero((torch.cat([*label]) >= 0) & trusted[journey])[:, 0]
     return used, journey[used]
+
+
+def tracklet_votes(
+    tracklets: Tracklets,
+    pairs: Candidates,
+    misfit: Float[Tensor, " p"],
+    error: ProjectionErrors,
+    rows: int,
+    config: CompleteTracksConfig,
+) -> Int[Tensor, " d"]:
+    """The sign that most detections of a tracklet lie on, for those that do; -1 for the others."""
+    # Where images are noisy most are farther off than `known_px`.
+    known_px = (_USUAL * error.usual_px).clamp_min(config.known_px)
+    limit = config.vote_share * pairs.size
+    limit = torch.where(error.is_known, known_px + config.known_share * pairs.size, limit)
+    best, sign = cheapest(pairs.row, pairs.sign, misfit, rows)
+    other = pairs.sign != sign[pairs.row]
+    second, _ = cheapest(pairs.row[other], pairs.sign[other], misfit[other], rows)
+    chosen = pairs.sign == sign[pairs.row]
+    inside = torch.zeros(rows, dtype=torch.bool, device=sign.device)
+    inside[pairs.row[chosen & (misfit < limit)]] = True
+    inside &= config.vote_clear * best < second
+    label = tracklets.label
+    voting = inside & (label >= 0)
+    owner, target, votes = distinct_pairs(label[voting], sign[voting])
+    size = group_count(label, tracklets.count)[owner]
+    wins = (votes >= config.vote_majority * size) & (votes >= config.vote_detections)
+    of_tracklet = torch.full((tracklets.count + 1,), -1, dtype=label.dtype, device=label.device)
+    of_tracklet[owner[wins]] = target[wins]
+    winner = of_tracklet[label]  # label -1 reads the last slot, which stays -1
+    return torch.where(inside & (sign == winner), sign, -1)

@@ -16,6 +16,7 @@ from worlds.sign_drive import (
     shift_of,
     signs_at,
     straight_poses,
+    tracklets_of,
     two_journeys,
     with_rows,
 )
@@ -210,11 +211,16 @@ def test_signs_go_astray_beside_the_cameras_that_saw_them(
     drifts = [begun], [se3.local(given, risen)]
     seen = torch.zeros(len(PLACES), dtype=torch.bool)
     unseen = torch.tensor([False, True, False])
-    found = without_strayed(after, before, [drive.journey], *drifts, seen, CONFIG, COMPLETION)
+    made = [tracklets_of(drive.sign)]
+    given, none = ([drive.journey], [risen], made, after, before, *drifts), torch.zeros(0, 2).long()
+    how = CONFIG, COMPLETION, torch.tensor([True])
+    found = without_strayed(*given, seen, none, *how)
     if not astray:
         assert found is None
-        # But what too few saw is none wherever it stands.
-        found = without_strayed(after, before, [drive.journey], *drifts, unseen, CONFIG, COMPLETION)
+        # What too few saw is none wherever it stands, but of two that may be one.
+        pair = torch.tensor([[0, 1]])
+        assert without_strayed(*given, unseen, pair, *how) is None
+        found = without_strayed(*given, unseen, none, *how)
     assert found is not None and len(found.heads) == len(PLACES) - 1
     assert torch.equal(found.heads.T_world_sign, moved[[0, 2]])
     number = torch.tensor([0, -1, 1])
@@ -249,10 +255,15 @@ def test_a_sign_seen_from_afar_alone_is_the_one_behind_it(fault: str):
     after = AssociatedSigns(heads, heads[:0], tuple(associations), completed)
     nothing = [torch.zeros(len(j.T_world_camera), 6, dtype=F64) for j in journeys]
     unseen = torch.zeros(2, dtype=torch.bool)
-    found = without_strayed(after, heads, journeys, nothing, nothing, unseen, CONFIG, COMPLETION)
+    poses, made = [j.T_world_camera for j in journeys], [tracklets_of(s) for s in shown]
+    given = journeys, poses, made, after, heads, nothing, nothing, unseen
+    how = CONFIG, COMPLETION, torch.ones(3, dtype=torch.bool)
+    found = without_strayed(*given, torch.zeros(0, 2).long(), *how)
     if fault:
         assert found is None
-    else:
-        assert found is not None and len(found.heads) == 1
-        assert torch.equal(found.heads.T_world_sign, heads.T_world_sign[:1])
-        assert bool((found.associations[2].sign == -1).all())
+        return
+    assert found is not None and len(found.heads) == 1
+    assert torch.equal(found.heads.T_world_sign, heads.T_world_sign[:1])
+    # What showed it shows the other now.
+    assert bool((found.associations[2].sign == 0).all()) and int(found.heads.n_journeys) == 3
+    assert without_strayed(*given, torch.tensor([[0, 1]]), *how) is None
