@@ -23,7 +23,12 @@ from crowdmap_torch.crowd_signs.duplicates import (
     gone_astray,
     same_sign,
 )
-from crowdmap_torch.crowd_signs.evidence import of_its_shape, of_trusted, seen_by, tracklet_votes
+from crowdmap_torch.crowd_signs.evidence import (
+    of_its_shape,
+    seen_by,
+    shown_by_trusted,
+    tracklet_votes,
+)
 from crowdmap_torch.crowd_signs.existence import existence, still_alone
 from crowdmap_torch.crowd_signs.projections import (
     Candidates,
@@ -133,7 +138,8 @@ def with_vouched(
     every = with_evidence(every, journeys, shown, trusted, completion)
     # What is drawn as another shape is as likely another sign, or none, that lies before or behind it.
     alike = [of_its_shape(a, j, every) for a, j in zip(shown, journeys, strict=True)]
-    vouched = seen_by(alike, len(every), trusted, completion)[n:] >= config.min_journeys
+    _, sign_shown, journey = shown_by_trusted(alike, trusted)
+    vouched = seen_by(sign_shown, journey, len(every), completion)[n:] >= config.min_journeys
     if not bool(vouched.any()):
         return found
     sure = existence(every.n_journeys[n:], passing, config.existence).to(heads.size)
@@ -319,13 +325,11 @@ def with_evidence(
     config: CompleteTracksConfig,
 ) -> Signs:
     """The signs with how often, by how many `trusted` journeys and when they were seen, from the detections of those."""
-    label = [a.sign for a in associations]
-    used, _ = of_trusted(label, trusted)
-    shown = torch.cat(label)[used]
+    used, shown, journey = shown_by_trusted([a.sign for a in associations], trusted)
     t_ns = torch.cat([j.t_ns[j.signs.frame] for j in journeys])[used]
     return replace(
         signs,
-        n_journeys=seen_by(label, len(signs), trusted, config),
+        n_journeys=seen_by(shown, journey, len(signs), config),
         n_observations=group_count(shown, len(signs)),
         first_seen_ns=signs.first_seen_ns.scatter_reduce(0, shown, t_ns, "amin"),
         last_seen_ns=signs.last_seen_ns.scatter_reduce(0, shown, t_ns, "amax"),

@@ -18,14 +18,10 @@ _USUAL = 2.0
 
 
 def seen_by(
-    label: Sequence[Int[Tensor, " _"]],
-    count: int,
-    trusted: Bool[Tensor, " j"],
-    config: CompleteTracksConfig,
+    shown: Int[Tensor, " u"], journey: Int[Tensor, " u"], count: int, config: CompleteTracksConfig
 ) -> Int[Tensor, " n"]:
-    """How many `trusted` journeys saw each of `count` signs; `label`s are the signs that detections show, -1 is none."""
-    used, journey = of_trusted(label, trusted)
-    owner, _, views = distinct_pairs(torch.cat([*label])[used], journey)
+    """How many journeys saw each of `count` signs, by the sign that each detection shows and its journey."""
+    owner, _, views = distinct_pairs(shown, journey)
     return group_count(owner[views >= config.evidence], count)
 
 
@@ -36,14 +32,18 @@ def of_its_shape(association: Association, journey: Journey, signs: Signs) -> In
     return shown.masked_fill(~alike, -1)
 
 
-def of_trusted(
+def shown_by_trusted(
     label: Sequence[Int[Tensor, " _"]], trusted: Bool[Tensor, " j"]
-) -> tuple[Int[Tensor, " u"], Int[Tensor, " u"]]:
-    """Rows, of all journeys' detections, that show a sign, of trusted journeys; and the journey of each."""
+) -> tuple[Int[Tensor, " u"], Int[Tensor, " u"], Int[Tensor, " u"]]:
+    """Rows, of all journeys' detections, that show a sign and are of trusted journeys; that sign, and the journey.
+
+    `label`: by journey the sign that each detection shows, -1 is none.
+    """
     size = torch.tensor([len(own) for own in label], device=trusted.device)
     journey = torch.repeat_interleave(torch.arange(len(label), device=trusted.device), size)
-    used = torch.nonzero((torch.cat([*label]) >= 0) & trusted[journey])[:, 0]
-    return used, journey[used]
+    shown = torch.cat([*label])
+    used = torch.nonzero((shown >= 0) & trusted[journey])[:, 0]
+    return used, shown[used], journey[used]
 
 
 def tracklet_votes(
