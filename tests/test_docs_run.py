@@ -132,7 +132,7 @@ SMALLER: Mapping[str, str] = {
     # It would serve until it is ended.
     "tensorboard": "--inspect",
 }
-"""What is appended to commands that begin so (the first that fits): the last of two values of an option counts."""
+"""What is appended to commands that begin so (the first that fits), in place of the same options."""
 OVERWRITE = ("simulate", "optimize", "convert", "view", "export")
 """Pages write the same names again and again; the reader of one page has them once."""
 
@@ -152,12 +152,24 @@ def needs(words: list[str]) -> str | None:
     return None
 
 
+def without(words: list[str], others: list[str]) -> list[str]:
+    """A command without the options, and their values, that others say anew: two pages' commands become one."""
+    kept, is_said_anew = [], False
+    for word in words:
+        if word.startswith("-"):
+            is_said_anew = word in others
+        if not is_said_anew:
+            kept.append(word)
+    return kept
+
+
 def whole(command: Command) -> list[str]:
     """The words of what is run for a command of a page."""
     text = COMPLETED.get(bare(command.text), command.text)
     words = words_of(text)
     said = " ".join(words)
-    words += next((more.split() for start, more in SMALLER.items() if said.startswith(start)), [])
+    more = next((more.split() for start, more in SMALLER.items() if said.startswith(start)), [])
+    words = [*without(words, more), *more]
     if words[0] == "crowdmap" and words[1] in OVERWRITE and "--add" not in words:
         words.append("--overwrite")
     return words

@@ -11,6 +11,7 @@ from crowdmap_torch.studies.curves import plot_bars
 from crowdmap_torch.studies.folder import StudyFolder
 from crowdmap_torch.studies.maps import OURS, in_short_turns, short_maps
 from crowdmap_torch.studies.numbers import results, spreads
+from crowdmap_torch.studies.scale import Scale
 from crowdmap_torch.studies.study import Settings, Study
 from crowdmap_torch.studies.tasks import Task
 
@@ -61,15 +62,22 @@ _NUMBERS = {
 }
 
 
+def variants(scale: Scale) -> dict[str, MapperConfig]:
+    """Ours, and those beside it."""
+    return dict(scale.first(VARIANTS.items(), beside=1))
+
+
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """A map for each variant and seed."""
-    return in_short_turns(2, (short_maps(settings.scale, c) for c in VARIANTS.values()))
+    return in_short_turns(
+        2, (short_maps(settings.scale, c) for c in variants(settings.scale).values())
+    )
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """The figures of each variant."""
     rows, bars = [], {}
-    for name, config in VARIANTS.items():
+    for name, config in variants(settings.scale).items():
         found = results(short_maps(settings.scale, config), folder)
         values = spreads(found, _NUMBERS)
         rows.append((name, *(value.mean for value in values.values()), len(found)))

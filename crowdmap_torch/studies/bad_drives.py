@@ -58,7 +58,7 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
 
 
 def _kinds(scale: Scale) -> tuple[str, ...]:
-    return (NONE, *KINDS[: scale.faults])
+    return (NONE, *scale.first(KINDS))
 
 
 def _maps(scale: Scale, kind: str) -> list[MeasureMap]:

@@ -84,8 +84,8 @@ class MeasureLinear(Task):
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """Both estimates for each seed."""
     scale = settings.scale
-    trembling = (_few(scale, variant.spoil) for variant in TREMBLES)
-    fleets = (_few(scale, _wrong(names)) for names in FLEETS.values())
+    trembling = (pairs for _, pairs in _tremble_pairs(scale))
+    fleets = (pairs for _, pairs in _fleet_pairs(scale))
     for pair in chain(_pairs(scale), *trembling, *fleets):
         for task in pair:
             yield SHORT_TURNS + 2 * task.simulation.seed, task
@@ -174,14 +174,14 @@ def _wrong(names: tuple[str, ...]) -> _Spoil:
 
 def _tremble_pairs(scale: Scale) -> Iterator[tuple[Cell, _Pairs]]:
     """By how far their outlines tremble."""
-    for variant in TREMBLES:
+    for variant in scale.first(TREMBLES, beside=1):
         pairs = _few(scale, variant.spoil)
         yield pairs[0][0].simulation.signs.jitter_px, pairs
 
 
 def _fleet_pairs(scale: Scale) -> Iterator[tuple[Cell, _Pairs]]:
     """By what is wrong."""
-    for told, names in FLEETS.items():
+    for told, names in scale.first(FLEETS.items(), beside=1):
         yield told, _few(scale, _wrong(names))
 
 

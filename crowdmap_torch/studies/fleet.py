@@ -72,7 +72,7 @@ RIGHT, FLEET = Variant(NONE), Variant(ALL)
 
 def variants(scale: Scale) -> tuple[Variant, ...]:
     """None, each error alone, and all of them."""
-    names = list(ERRORS)[: scale.fleet_errors]
+    names = scale.first(ERRORS)
     alone = (Variant(name, factor) for name in names for factor in _FACTORS[: scale.fleet_factors])
     return (RIGHT, *alone, *(Variant(ALL, factor) for factor in _FACTORS[: scale.fleet_factors]))
 

@@ -91,14 +91,14 @@ _LINES = {
 def tasks(settings: Settings) -> Iterator[tuple[int, Task]]:
     """A map for each value and seed; that of the defaults counts for every sweep."""
     scale = settings.scale
-    swept = ((sweep, value) for sweep in SWEEPS.values() for value in _values(scale, sweep))
+    swept = ((sweep, value) for sweep in _sweeps(scale).values() for value in _values(scale, sweep))
     return in_short_turns(4, (_maps(scale, sweep, value) for sweep, value in swept))
 
 
 def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
     """Figures over each sweep."""
     scale, rows, panels = settings.scale, [], []
-    for name, sweep in SWEEPS.items():
+    for name, sweep in _sweeps(scale).items():
         values = sorted(_values(scale, sweep))
         found = [results(_maps(scale, sweep, value), folder) for value in values]
         measured = [spreads(maps, _NUMBERS) for maps in found]
@@ -117,6 +117,10 @@ def chapter(settings: Settings, folder: StudyFolder) -> Chapter:
         tables=(Table("noise", ("sweep", "value", *_NUMBERS, "seeds"), tuple(rows)),),
         plots={"noise": plot_lines(panels, x="", y="mean error [m]", rows=2)},
     )
+
+
+def _sweeps(scale: Scale) -> dict[str, Sweep]:
+    return dict(scale.first(SWEEPS.items()))
 
 
 def _values(scale: Scale, sweep: Sweep) -> tuple[float, ...]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import TypeVar
 
 from crowdmap_torch.simulate.dataset import SimulationConfig
 from crowdmap_torch.simulate.fleet import FleetConfig
@@ -12,6 +15,7 @@ from crowdmap_torch.simulate.roads import RoadShape
 from crowdmap_torch.simulate.vehicle import VehicleConfig
 from crowdmap_torch.simulate.worlds import WORLD_PRESETS, WorldConfig
 
+K = TypeVar("K")
 SHORT_TURNS = 4
 """Turns between the seeds of studies on the short road: many maps of little weight, which wait for the first seeds of
 the others."""
@@ -66,8 +70,6 @@ class Scale:
     """Seeds of theirs on which it is judged whether maps of drives with all errors know how wrong they are."""
     whole_fleet_seeds: int = 5
     """Seeds at `journeys` that are driven by a fleet with all errors."""
-    fleet_errors: int | None = None
-    """Errors that are looked at alone; None: all."""
     fleet_factors: int = 2
     """How many of their sizes."""
     long_lengths_m: tuple[float, ...] = (1000.0, 20000.0)
@@ -91,8 +93,8 @@ class Scale:
     """Most maps of one or two journeys of a dataset, other journeys each time."""
     noise_steps: int = 3
     """Steps of each sweep, beside the default."""
-    faults: int | None = None
-    """Kinds of bad drives; None: all."""
+    kinds: int | None = None
+    """Errors of fleets, bad drives, worse inputs and ideas of ours that a study takes one after another; None: all."""
 
     def drives(self, seed: int, *, positioning: str = "paper", lanes: bool = True):
         """The drives on the road; without `lanes` nothing but signs was detected, the same as with them."""
@@ -106,6 +108,10 @@ class Scale:
             seed=seed,
         )
         return simulation if lanes else without_lanes(simulation)
+
+    def first(self, kinds: Iterable[K], *, beside: int = 0) -> list[K]:
+        """The kinds that a study takes, and before them so many that it holds them beside."""
+        return list(islice(kinds, None if self.kinds is None else beside + self.kinds))
 
     def short_drives(self, seed: int) -> SimulationConfig:
         """The drives on the short road."""
@@ -153,9 +159,10 @@ _HOUSES = replace(
     lights_per_km=0.0,
     signs=replace(WORLD_PRESETS["street"].signs, posts_per_km=60.0),
 )
+_FEWER = replace(_HOUSES, length_m=60.0)
 QUICK = Scale(
     road=_HOUSES,
-    short_road=replace(_HOUSES, length_m=60.0),
+    short_road=_FEWER,
     vehicle=VehicleConfig(frame_rate_hz=5.0),
     rig=RigConfig(camera="pinhole"),
     counts=(1, 3),
@@ -169,14 +176,13 @@ QUICK = Scale(
     short_seeds=1,
     honest_journeys=3,
     honest_sets=1,
-    fleet_road=_HOUSES,
-    straight_road=replace(_HOUSES, road=RoadShape(heading_deg=0.0, grade=0.0, bank_deg=0.0)),
+    fleet_road=_FEWER,
+    straight_road=replace(_FEWER, road=RoadShape(heading_deg=0.0, grade=0.0, bank_deg=0.0)),
     fleet_journeys=2,
     fleet_vehicles=2,
     fleet_seeds=1,
-    fleet_sets=2,
+    fleet_sets=1,
     whole_fleet_seeds=1,
-    fleet_errors=1,
     fleet_factors=1,
     long_lengths_m=(60.0, 120.0),
     long_share=0.1,
@@ -185,6 +191,6 @@ QUICK = Scale(
     linear_sets=1,
     draws=1,
     noise_steps=1,
-    faults=2,
+    kinds=1,
 )
 """A street of a few houses; its figures say that everything runs, nothing else."""

@@ -12,9 +12,9 @@ from crowdmap_torch.studies.study import Settings
 
 @pytest.fixture
 def settings() -> Settings:
-    """The quick scale with two seeds of everything."""
+    """The quick scale with two seeds, and all kinds, of everything."""
     seeds = ("seeds", "curve_seeds", "preset_seeds", "short_seeds", "honest_sets", "linear_sets")
-    return Settings(replace(QUICK, **dict.fromkeys(seeds, 2)), None)
+    return Settings(replace(QUICK, kinds=None, **dict.fromkeys(seeds, 2)), None)
 
 
 @pytest.fixture

@@ -28,5 +28,5 @@ def test_a_bad_drive_counts_as_named_if_it_is_and_good_ones_as_named_wrongly(
 def test_there_is_a_map_of_every_fault_and_seed(settings: Settings):
     drives = {(t.simulation.bad_drives, t.simulation.seed) for t in work(bad_drives, settings)}
     kinds = {faults for faults, _ in drives}
-    assert len(kinds) == 1 + len(KINDS[: settings.scale.faults])
+    assert len(kinds) == 1 + len(settings.scale.first(KINDS))
     assert len(drives) == len(kinds) * settings.scale.short_seeds

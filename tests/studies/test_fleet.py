@@ -20,7 +20,7 @@ ONE_SEED = Settings(
         fleet_seeds=1,
         fleet_sets=0,
         whole_fleet_seeds=1,
-        fleet_errors=2,
+        kinds=2,
         fleet_journeys=2,
         journeys=3,
         counts=(3,),
@@ -76,7 +76,7 @@ def test_errors_are_told_beside_the_drives_without_them(folder: StudyFolder):
 
 
 def test_coverage_counts_every_sign_once(tmp_path: Path):
-    settings = Settings(replace(ONE_SEED.scale, fleet_seeds=2, fleet_errors=0), None)
+    settings = Settings(replace(ONE_SEED.scale, fleet_seeds=2, kinds=0), None)
     folder = StudyFolder(tmp_path)
 
     def result(task):
@@ -91,7 +91,7 @@ def test_coverage_counts_every_sign_once(tmp_path: Path):
 
 
 def test_whether_fleets_know_how_wrong_they_are_is_asked_of_many_sets(tmp_path: Path):
-    settings = Settings(replace(ONE_SEED.scale, fleet_errors=0, fleet_sets=4), None)
+    settings = Settings(replace(ONE_SEED.scale, kinds=0, fleet_sets=4), None)
     folder = StudyFolder(tmp_path)
 
     def result(task):

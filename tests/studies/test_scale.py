@@ -38,3 +38,10 @@ def test_the_quick_scale_is_smaller_in_everything():
     ):
         assert getattr(QUICK, name) < getattr(FULL, name)
     assert QUICK.road.length_m < FULL.road.length_m
+
+
+def test_of_kinds_the_quick_scale_takes_the_first_beside_what_it_is_held_against():
+    assert QUICK.kinds is not None
+    assert FULL.first("abcde") == FULL.first("abcde", beside=1) == list("abcde")
+    assert QUICK.first("abcde") == list("abcde"[: QUICK.kinds])
+    assert QUICK.first("abcde", beside=1) == list("abcde"[: 1 + QUICK.kinds])
