@@ -21,6 +21,7 @@ from crowdmap_torch.geometry import camera
 from crowdmap_torch.geometry.trajectory import motion
 from crowdmap_torch.lanes.reconstruct import reconstruct_lanes
 from crowdmap_torch.noise.calibration import KnownCalibration, corrected_journey, corrected_rig
+from crowdmap_torch.noise.white_noise import WhiteNoise
 from crowdmap_torch.road.estimate import RoadTracker
 from crowdmap_torch.signs.triangulate import triangulate_signs
 from crowdmap_torch.tables import (
@@ -107,6 +108,7 @@ class SingleJourneyMapper:
         self.rig = rig = corrected_rig(rig, self.known)
         self._given: list[tuple[Tensor, Tensor]] = []
         """Time and pose, as they came, of the frames of the last moments."""
+        self._white = WhiteNoise(config.positioning)
         self._signs = SignAssociator(config.positioning, config.sign_association)
         self._lanes = LaneAssociator(config.lane_association)
         self._road = RoadTracker(rig, config.positioning, config.road)
@@ -130,7 +132,9 @@ class SingleJourneyMapper:
         frame = self._corrected(frame)
         pose, number = frame.T_world_camera[0], self._next
         self._next += 1
-        sign_label, sign_shift = self._signs.step(number, pose, frame.signs)
+        self._white.follow(*(x.cpu().numpy() for x in (frame.t_ns, pose[None, :3, 3])))
+        white_sigma_m = self._white.sigma_m
+        sign_label, sign_shift = self._signs.step(number, pose, frame.signs, white_sigma_m)
         lane_label = self._lanes.step(number, pose, frame.lanes, frame.lane_points, frame.rig)
         road = self._road.advance(frame)
         self._held.append(_HeldFrame(frame, sign_label, sign_shift, lane_label, road))
@@ -156,6 +160,7 @@ class SingleJourneyMapper:
     def state_dict(self) -> dict[str, object]:
         """Everything that the next step needs."""
         return {
+            "white": copy.deepcopy(self._white),
             "signs": self._signs.state_dict(),
             "lanes": self._lanes.state_dict(),
             "road": copy.deepcopy(self._road),
@@ -168,6 +173,7 @@ class SingleJourneyMapper:
 
     def load_state_dict(self, state: dict) -> None:
         """Go on where another mapper with the same rig and configuration stopped."""
+        self._white = copy.deepcopy(state["white"])
         self._signs.load_state_dict(state["signs"])
         self._lanes.load_state_dict(state["lanes"])
         self._road = copy.deepcopy(state["road"])

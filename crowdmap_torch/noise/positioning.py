@@ -60,7 +60,8 @@ class PositioningNoise(Settings):
     rotation_length_m: Length = 100.0
     """Way over which its correlation falls to 1/e [m]."""
     white_sigma_m: SigmaOrNone = 0.02
-    """Noise of the position from frame to frame [m]: what a filter of GNSS and IMU leaves, as in simulations."""
+    """Noise of the position from frame to frame [m]: what a filter of GNSS and IMU leaves, as in simulations. Where frames
+    of a drive show more, what they show counts, up to ten times this."""
     white_sigma_deg: SigmaOrNone = 0.03
     """Noise of the rotation from frame to frame [deg]; fits of single drives hardly tell 0.02 from 0.03 (kitti-signs)."""
 

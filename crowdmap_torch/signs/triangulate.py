@@ -13,6 +13,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import group_argmin, group_mode, group_sum
 from crowdmap_torch.geometry import camera, polygon, se3
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.noise.white_noise import with_white_noise
 from crowdmap_torch.optim.robust import usual
 from crowdmap_torch.ranges import (
     Count,
@@ -39,7 +40,6 @@ from crowdmap_torch.signs.views import SignFit, SignStart, SignViews, distance_a
 from crowdmap_torch.tables import Journey, Signs, Tracklets
 
 METHODS = ("joint", "paper2017")
-
 REASONS = (
     "kept",
     "too few frames",
@@ -146,6 +146,7 @@ def triangulate_signs(
     if not len(rows):
         none = _no_signs(journey)
         return none, SignReport(reason, tracklets, _per_detection(journey), none)
+    positioning = with_white_noise(positioning, journey)
     label, sign = tracklets.label[rows].unique(return_inverse=True)
     seen = _Seen(tracklets, label, rows, views_of(journey, tracklets, rows, sign))
     drive = drive_path(journey, positioning, config.fit.nonholonomic, config.fit.drift)

@@ -20,6 +20,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.assignment import gated_matching, matching_of_near
 from crowdmap_torch.geometry import depth_filter, polygon
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.noise.white_noise import white_noise_along
 from crowdmap_torch.tables import Journey, SignDetections, Tracklets
 from crowdmap_torch.tracking.causal import (
     ActiveTracklets,
@@ -73,7 +74,6 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         super().__init__(ActiveSigns(none, none, votes, none, *state))
         self.positioning = positioning
         self.config = config
-        self._pose_variance = positioning.white_sigma_m**2 + positioning.walk_m**2 / 2
         self._log_noise = 0.0
         """Logarithm of the noise's variance over what is expected, as sightings so far have it."""
 
@@ -87,11 +87,16 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         self._log_noise = state["log_noise"]
 
     def advance(
-        self, features: SignFeatureArrays, rows: Int[np.ndarray, " m"], pair_costs: CostLookup
+        self,
+        features: SignFeatureArrays,
+        rows: Int[np.ndarray, " m"],
+        pair_costs: CostLookup,
+        white_sigma_m: float,
     ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
         """Tracklet and corner shift of each of the detections `rows` of `features`, which are those of one frame.
 
-        `features` must also hold every active tracklet's last measurement.
+        `features` must also hold every active tracklet's last measurement. Positions jump by `white_sigma_m` [m] from
+        frame to frame.
         """
         if not len(rows):
             return rows, rows
@@ -100,13 +105,14 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         if silent_for.max(initial=0) > self.config.window:
             old = old[silent_for <= self.config.window]
         sighting, variance = features.sighting[rows], self._noise * features.variance[rows]
-        prediction = self._predict(old, features, int(rows[0]))
+        prediction = self._predict(old, features, int(rows[0]), white_sigma_m)
         epipolar_px2 = pair_costs(old.last[:, None], rows[None])
         if self.config.method == "paper2017":
             row, column = matching_of_near(epipolar_px2, self.config.paper.max_cost_px2)
         else:
             innovation = depth_filter.innovation(prediction, sighting, variance)
-            cost = self._costs(old, features, rows, prediction, innovation, epipolar_px2)
+            seen = prediction, innovation, epipolar_px2
+            cost = self._costs(old, features, rows, *seen, white_sigma_m)
             row, column = gated_matching(cost, self.config.unmatched_cost)
             sure = old.votes[row].sum(-1) >= self.config.sure_after
             self._learn(innovation.distance_sq[row[sure], column[sure]])
@@ -133,18 +139,25 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
 
     @torch.no_grad()
     def step(
-        self, frame: int, T_world_camera: Float[Tensor, "4 4"], detections: SignDetections
+        self,
+        frame: int,
+        T_world_camera: Float[Tensor, "4 4"],
+        detections: SignDetections,
+        white_sigma_m: float | None = None,
     ) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
         """Tracklet and corner shift of each of one frame's detections; frame indices must increase.
 
-        Keeps the last measurement of the active tracklets and nothing else.
+        Positions jump by `white_sigma_m` [m] from frame to frame (None: as configured). Keeps the last measurement of the
+        active tracklets and nothing else.
         """
+        if white_sigma_m is None:
+            white_sigma_m = self.positioning.white_sigma_m
         device = detections.frame.device
         detections = replace(detections, frame=torch.full_like(detections.frame, frame))
         pose = T_world_camera.expand(len(detections), 4, 4)
         features, rows = self._behind_recent(sign_features(detections, pose, self.config))
         costs = costs_on_demand(features, partial(sign_pair_costs, config=self.config))
-        label, shift = self.advance(SignFeatureArrays.of(features), rows, costs)
+        label, shift = self.advance(SignFeatureArrays.of(features), rows, costs, white_sigma_m)
         self._keep_last(features)
         return torch.from_numpy(label).to(device), torch.from_numpy(shift).to(device)
 
@@ -160,7 +173,7 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
             self._log_noise = max(self._log_noise + step, 0.0)
 
     def _predict(
-        self, old: ActiveSigns, features: SignFeatureArrays, now: int
+        self, old: ActiveSigns, features: SignFeatureArrays, now: int, white_sigma_m: float
     ) -> depth_filter.Prediction:
         """Where the tracklets should appear in the frame of row `now`."""
         T_now, T_last = features.T_world_camera[now], features.T_world_camera[old.last]
@@ -172,7 +185,7 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
             depth_filter.DepthState(old.mean, old.covariance),
             R_t @ T_last[:, :3, :3],
             t,
-            variance_position=2 * p.white_sigma_m**2 + p.walk_m**2 * travel,
+            variance_position=2 * white_sigma_m**2 + p.walk_m**2 * travel,
             variance_rotation=2 * p.white_sigma_rad**2 + p.walk_rad**2 * travel,
         )
 
@@ -184,6 +197,7 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         prediction: depth_filter.Prediction,
         innovation: depth_filter.Innovation,
         epipolar_px2: Float[np.ndarray, "n m"],
+        white_sigma_m: float,
     ) -> Float[np.ndarray, "n m"]:
         """Cost of continuing each tracklet with each detection."""
         c = self.config
@@ -193,7 +207,8 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
         refused |= (depth < c.min_depth_m) | (depth > c.max_depth_m)
         # The poses' own noise moves the epipolar lines of near signs.
         pose_px2 = (features.focal[rows] / np.maximum(depth, c.min_depth_m)) ** 2
-        epipolar = epipolar_px2 / (self._noise * c.sigma_px**2 + pose_px2 * self._pose_variance)
+        pose_variance = white_sigma_m**2 + self.positioning.walk_m**2 / 2
+        epipolar = epipolar_px2 / (self._noise * c.sigma_px**2 + pose_px2 * pose_variance)
         # A tracklet that is known well enough to be predicted may break the epipolar gate: its last measurement may
         # have been the wrong one.
         count = old.votes.sum(-1)[:, None]
@@ -243,8 +258,10 @@ def associate_signs(
     associator = SignAssociator(positioning, config)
     arrays = SignFeatureArrays.of(features.to("cpu"))
     label, shift = np.full(len(order), -1), np.zeros(len(order), dtype=np.int64)
+    white_sigma_m = white_noise_along(journey, positioning)
     for rows in rows_of_frames(arrays.frame):
-        label[rows], shift[rows] = associator.advance(arrays, rows, costs)
+        white = float(white_sigma_m[arrays.frame[rows[0]]])
+        label[rows], shift[rows] = associator.advance(arrays, rows, costs, white)
     back = torch.argsort(order)
     label, shift = (torch.from_numpy(column).to(order.device)[back] for column in (label, shift))
     return Tracklets(label, associator.count, shift)
