@@ -19,6 +19,8 @@ from crowdmap_torch.tables import Journey
 _FRAMES = 4
 _MOST_SPAN_NS = 1_000_000_000
 """Frames further apart than this in all tell nothing: meanwhile a car may do as it likes."""
+_LEAST_WAY_M = 0.5
+"""A car that moves less meanwhile stands, and positions are held then: they tell nothing of others."""
 _MOST = 10.0
 """So many times what is configured, at most: positions that stand still and leap are no noise."""
 _FAR_SQ = 9.0
@@ -54,7 +56,7 @@ class WhiteNoise:
         position = np.concatenate((self._position, position))
         known, sigma = len(self._t_ns), np.full(len(t_ns), self.sigma_m)
         for at, square in enumerate(_squares(t_ns, position, self._walk_m)[known:].tolist()):
-            if square == square:
+            if not math.isnan(square):
                 self._learn(square)
             sigma[known + at] = self.sigma_m
         self._t_ns, self._position = t_ns[1 - _FRAMES :], position[1 - _FRAMES :]
@@ -63,7 +65,9 @@ class WhiteNoise:
     def _learn(self, square: float) -> None:
         self._frames += 1
         gain = 1 / min(self._frames + _PRIOR_FRAMES, _MEMORY_FRAMES)
-        self._variance += gain * (min(square, _FAR_SQ * self._variance) - self._variance)
+        learned = self._variance + gain * (min(square, _FAR_SQ * self._variance) - self._variance)
+        # From less it would take its time to find that there is noise.
+        self._variance = max(learned, self._given_m**2)
 
 
 def _squares(
@@ -81,6 +85,7 @@ def _squares(
     when = [t_ns[k : k + windows] for k in range(_FRAMES)]
     place = [position[k : k + windows] for k in range(_FRAMES)]
     usable = (when[-1] - when[0] <= _MOST_SPAN_NS) & np.all(np.diff(when, axis=0) > 0, axis=0)
+    usable &= _length(place[-1] - place[0]) > _LEAST_WAY_M
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = []
         for own in when:
@@ -92,12 +97,15 @@ def _squares(
         mean_sq = (off[:, 0] ** 2 + off[:, 1] ** 2 + off[:, 2] ** 2) / (3 * norm_sq)
         walked = 0.0
         for step, ahead in enumerate((b + c + d, c + d, d)):
-            move = place[step + 1] - place[step]
-            way = np.sqrt(move[:, 0] ** 2 + move[:, 1] ** 2 + move[:, 2] ** 2)
+            way = _length(place[step + 1] - place[step])
             walked = walked + ahead * ahead * way / norm_sq
         found = np.maximum(mean_sq - walk_m**2 * walked, 0.0)
     square[_FRAMES - 1 :] = np.where(usable, found, np.nan)
     return square
+
+
+def _length(move: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:
+    return np.sqrt(move[:, 0] ** 2 + move[:, 1] ** 2 + move[:, 2] ** 2)
 
 
 def white_noise_along(journey: Journey, positioning: PositioningNoise) -> Float[np.ndarray, " f"]:
@@ -107,6 +115,8 @@ def white_noise_along(journey: Journey, positioning: PositioningNoise) -> Float[
 
 
 def with_white_noise(positioning: PositioningNoise, journey: Journey) -> PositioningNoise:
-    """The noise of positions with that from frame to frame as a journey shows it."""
+    """The noise of positions with that from frame to frame as a journey shows it: in half of its frames it is less."""
     found = white_noise_along(journey, positioning)
-    return replace(positioning, white_sigma_m=float(found[-1])) if len(found) else positioning
+    return (
+        replace(positioning, white_sigma_m=float(np.median(found))) if len(found) else positioning
+    )

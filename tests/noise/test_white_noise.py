@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from worlds.drives import make_journey
+from worlds.sign_drive import RIG, straight_poses
 
 from crowdmap_torch.noise.positioning import PositioningNoise
-from crowdmap_torch.noise.white_noise import WhiteNoise
+from crowdmap_torch.noise.white_noise import WhiteNoise, white_noise_along, with_white_noise
 
 GIVEN = PositioningNoise()
 
@@ -67,6 +71,28 @@ def test_a_leap_is_no_noise_and_positions_that_leap_all_the_time_are_some_at_mos
     assert WhiteNoise(GIVEN).follow(t_ns, position).max() < 1.5 * GIVEN.white_sigma_m
     standing = position[np.arange(400) // 2 * 2]
     assert WhiteNoise(GIVEN).follow(t_ns, standing)[-1] == 10 * GIVEN.white_sigma_m
+
+
+def test_a_car_that_stands_tells_nothing_of_how_it_drives():
+    t_ns, position = drive(300, noise_m=(0.1, 0.1, 0.1))
+    held = np.broadcast_to(position[199], (600, 3))
+    t_held = t_ns[199] + 100_000_000 * np.arange(1, 601)
+    noise = WhiteNoise(GIVEN)
+    before = noise.follow(t_ns[:200], position[:200])[-1]
+    standing = noise.follow(t_held, held)
+    assert (standing[5:] == standing[-1]).all() and standing[-1] == pytest.approx(before, rel=0.1)
+
+
+def test_a_journey_is_mapped_by_what_it_shows_in_most_of_its_frames():
+    t_ns, position = drive(600, noise_m=(0.1, 0.1, 0.1))
+    position[400:] = drive(600)[1][400:] + position[399] - drive(600)[1][399]
+    journey = make_journey(RIG, straight_poses(600))
+    T = journey.T_world_camera.clone()
+    T[:, :3, 3] = torch.from_numpy(position)
+    journey = replace(journey, T_world_camera=T, t_ns=torch.from_numpy(t_ns))
+    along = white_noise_along(journey, GIVEN)
+    mapped_by = with_white_noise(GIVEN, journey).white_sigma_m
+    assert mapped_by == pytest.approx(0.1, rel=0.3) and 1.3 * along[-1] < mapped_by
 
 
 def test_frames_far_apart_tell_nothing():
