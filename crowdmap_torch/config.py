@@ -29,7 +29,7 @@ from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.ranges import Seed, Settings, Share, shown
 from crowdmap_torch.residuals.sign_prior import SignHabit
 from crowdmap_torch.road.estimate import RoadConfig
-from crowdmap_torch.signs.triangulate import SignTriangulationConfig
+from crowdmap_torch.signs.pruning import SignTriangulationConfig
 from crowdmap_torch.survey.control import ControlConfig
 from crowdmap_torch.tracking.lane_features import LaneAssociationConfig
 from crowdmap_torch.tracking.sign_features import SignAssociationConfig

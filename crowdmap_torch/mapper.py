@@ -28,13 +28,13 @@ from crowdmap_torch.crowd_lanes.placed_drives import place_drives
 from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
 from crowdmap_torch.crowd_lanes.tie_groups import GroupTies
 from crowdmap_torch.crowd_signs.complete_tracks import (
-    AssociatedSigns,
-    CompletedTracks,
     associate_detections,
     associated_once,
     completed_signs,
+    with_company,
     without_strayed,
 )
+from crowdmap_torch.crowd_signs.completion import AssociatedSigns, CompletedTracks
 from crowdmap_torch.crowd_signs.duplicates import may_be_one
 from crowdmap_torch.crowd_signs.gather import gather_signs, signs_of_crowd
 from crowdmap_torch.crowd_signs.journey_bias import without_bias
@@ -48,6 +48,7 @@ from crowdmap_torch.io.stored_drives import StoredDrive
 from crowdmap_torch.lanes.reconstruct import LaneReport, reconstruct_lanes
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.levenberg_marquardt import LmState
+from crowdmap_torch.processes.progress import ProgressCall, silent
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.processes.workers import Call
 from crowdmap_torch.road.estimate import estimate_road
@@ -68,11 +69,7 @@ from crowdmap_torch.tables import (
 from crowdmap_torch.tracking.lanes import associate_lanes
 from crowdmap_torch.tracking.signs import associate_signs
 
-ProgressCall = Callable[[str, int, int], object]
-
-
-def silent(*told: object) -> None:
-    """Nobody listens."""
+KeepCall = Callable[[int, "JourneyMap"], object]
 
 
 @dataclass(frozen=True)
@@ -86,11 +83,7 @@ class JourneyMap:
     road: RoadEstimate
     lane_tracklets: Tracklets
     lanes: Lanes
-    """O2."""
     lane_report: LaneReport
-
-
-KeepCall = Callable[[int, JourneyMap], object]
 
 
 @dataclass(frozen=True)
@@ -102,7 +95,6 @@ class FirstMap:
     lane_support: LaneSupport
     """Which lane each place of the journeys' own lane pieces is of."""
     tentative: Signs
-    """Signs that too few journeys saw."""
     lane_rounds: tuple[LaneRound, ...]
     """Clusterings of the journeys' lane pieces (`paper2017`; else none)."""
     crowd: Crowd
@@ -117,6 +109,8 @@ class FirstMap:
     """How often it was made anew of an adjusted map."""
     joined: int = 0
     """Signs that went into others then, or astray."""
+    found_later: int = 0
+    """Signs that came to the map then."""
     before: FirstMap | None = None
     """That of the clusters, before any adjustment, where it was made anew."""
     footing: Footing | None = None
@@ -194,8 +188,7 @@ def map_journeys(
         (journeys[n].journey_id, map_journey, (drives[n], n, config, tracked.get(n))) for n in left
     ]
     for place, made in engine.each(calls):
-        number = left[place]
-        maps[number] = made
+        maps[number := left[place]] = made
         keep(number, made)
         progress(stage, len(maps), total)
     return tuple(maps[number] for number in range(total))
@@ -295,6 +288,7 @@ def build_bundle(
     Signs that are in `control` pin the map; of some cars the calibration may be known already, by name.
     """
     config = config.resolved()
+    pins = None if control is None else find_control_signs(first.signs, control, config.control)
     return adjust.build(
         journeys,
         [m.road for m in maps],
@@ -310,9 +304,7 @@ def build_bundle(
         calibration=config.calibration,
         known_cars=known_cars,
         footing=first.footing,
-        control=None
-        if control is None
-        else find_control_signs(first.signs, control, config.control),
+        control=pins,
     )
 
 
@@ -351,10 +343,11 @@ def made_anew(
     config: MapperConfig,
     engine: Engine | None = None,
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
-    """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: none did.
+    """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: nothing.
 
     None is what went astray, is another one from afar, or fits too few drives and is none of two that may be one. Markers
-    that are there twice are joined anew. With it the covariances, if they had to be known for that.
+    that are there twice are joined anew, signs of single drives that are one come in while a round is left that can tell
+    whether they fit. With it the covariances, if they had to be known for that.
     """
     rules = config.duplicate_signs
     if first.completed is None or first.anew >= rules.rounds:
@@ -374,9 +367,13 @@ def made_anew(
         known = map_uncertainty(bundle, first.signs, first.lanes, engine)
         found = replace(found, heads=replace(signs, covariance=known.of_their_own))
         once = associated_once(*given, found, *how)
-    if joined is None and once is None:
+    left, more = once or found, None
+    if first.anew + 1 < rules.rounds:
+        made = [m.signs for m in maps], [m.sign_report.from_afar for m in maps]
+        more = with_company(*given, left, first.associations, *made, crowd, config.crowd, *how)
+    if joined is None and once is None and more is None:
         return None, known
-    found = once or found
+    found = more or left
     return replace(
         first,
         signs=found.heads,
@@ -387,7 +384,8 @@ def made_anew(
         drifts=drifts,
         completed=found.completed,
         anew=first.anew + 1,
-        joined=first.joined + len(signs) - len(found.heads),
+        joined=first.joined + len(signs) - len(left.heads),
+        found_later=first.found_later + len(found.heads) - len(left.heads),
         before=first.before or first,
         footing=footing_of(bundle),
     ), known

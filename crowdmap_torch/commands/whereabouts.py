@@ -21,6 +21,7 @@ from crowdmap_torch.io.errors import input_read, needing
 from crowdmap_torch.io.remote import Place, at_hand
 from crowdmap_torch.io.stored_drives import StoredDrive, stored_drives
 from crowdmap_torch.plausibility.dataset import Look, look_over
+from crowdmap_torch.processes.progress import silent
 from crowdmap_torch.processes.threads import repeatable
 from crowdmap_torch.processes.workers import WorkerLost
 from crowdmap_torch.tables import Dataset, Tracklets, to_device
@@ -77,7 +78,7 @@ class Whereabouts(ExitStack):
                 most = min(most, sum(1 for _ in (place / "journeys").iterdir()))
             for number in range(most):
                 # To come to it, a worker imports all that mapping a journey takes.
-                self.engine.submit(number, ("the start of a worker", mapper.silent, ()))
+                self.engine.submit(number, ("the start of a worker", silent, ()))
                 self._starting += 1
 
     def bring(self, place: Place, journeys: Sequence[str] | None) -> None:

@@ -8,7 +8,7 @@ tracklets that were too short or too uncertain to be triangulated, and signs tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,7 +16,12 @@ from torch import Tensor
 
 from crowdmap_torch.clustering.assignment import match_slots
 from crowdmap_torch.clustering.groups import cheapest, group_count
-from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
+from crowdmap_torch.crowd_signs.company import frame_number, in_company, passing_of, placed_by
+from crowdmap_torch.crowd_signs.completion import (
+    AssociatedSigns,
+    CompletedTracks,
+    CompleteTracksConfig,
+)
 from crowdmap_torch.crowd_signs.duplicates import (
     DuplicateSignConfig,
     duplicate_signs,
@@ -26,10 +31,12 @@ from crowdmap_torch.crowd_signs.duplicates import (
 from crowdmap_torch.crowd_signs.evidence import (
     of_its_shape,
     seen_by,
+    shown_by_members,
     shown_by_trusted,
     tracklet_votes,
 )
 from crowdmap_torch.crowd_signs.existence import existence, still_alone
+from crowdmap_torch.crowd_signs.gather import signs_of_crowd
 from crowdmap_torch.crowd_signs.projections import (
     Candidates,
     box,
@@ -40,29 +47,6 @@ from crowdmap_torch.crowd_signs.projections import (
 from crowdmap_torch.crowd_signs.register import Crowd, CrowdConfig
 from crowdmap_torch.geometry import polygon
 from crowdmap_torch.tables import Association, Journey, Signs, Tracklets, concatenate
-
-
-@dataclass(frozen=True)
-class CompletedTracks:
-    """The associations with what was brought back, and how much that is."""
-
-    associations: tuple[Association, ...]
-    fitting: int
-    """Detections that lie on the projection of their sign."""
-    displaced: int
-    """Detections of the right size and shape beside it, while nothing else shows it."""
-
-
-@dataclass(frozen=True)
-class AssociatedSigns:
-    """The signs of the first map, and which of them each detection shows."""
-
-    heads: Signs
-    tentative: Signs
-    """Signs that too few journeys saw."""
-    associations: tuple[Association, ...]
-    completed: CompletedTracks | None
-    """What clustering had set aside and was given back; None with `paper2017`, which does not."""
 
 
 def associate_detections(
@@ -78,8 +62,9 @@ def associate_detections(
     `poses` are the journeys' with the biases of the crowd taken off. A head that is another one badly placed goes, a sign of
     one journey that others see too becomes one.
     """
+    given, clusters = (journeys, poses, tracklets), (crowd.members, crowd.label, crowd.heads)
     associations = tuple(
-        member_association(journey, made, crowd, number)
+        with_members(no_association(journey), made, *clusters, number)
         for number, (journey, made) in enumerate(zip(journeys, tracklets, strict=True))
     )
     if config.method == "paper2017":
@@ -89,9 +74,7 @@ def associate_detections(
     heads = crowd.heads[~duplicate]
     associations = without_signs(associations, duplicate)
     trusted = crowd.journey_weight > 0
-    heads, completed = completed_signs(
-        journeys, poses, tracklets, heads, associations, completion, trusted=trusted
-    )
+    heads, completed = completed_signs(*given, heads, associations, completion, trusted=trusted)
     associations = completed.associations
     sure = existence(heads.n_journeys, of_heads[~duplicate], config.existence)
     # What a bad drive alone saw, or one where its positions were off, is nothing to look for.
@@ -100,7 +83,6 @@ def associate_detections(
     alone = still_alone(tentative, tracklets, associations)
     heads = replace(heads, confidence=sure.to(heads.size))
     found = AssociatedSigns(heads, tentative[alone], associations, completed)
-    given = journeys, poses, tracklets
     found = with_vouched(*given, found, passing[alone], config, completion, trusted=trusted)
     # In which not even the journey that saw them has any confidence.
     return replace(found, tentative=found.tentative[found.tentative.confidence > 0])
@@ -126,11 +108,13 @@ def with_vouched(
     if not len(singles):
         return found
     every, n = concatenate([heads, singles]), len(heads)
+    row = n + torch.arange(len(singles), device=singles.shape.device)
     drives = zip(journeys, poses, tracklets, found.associations, strict=True)
     # What lies on no head was compared with all of them before.
     shown = tuple(
         _with_fitting(
-            *(journey, pose, made, every, _with_singles(seen, made, singles, n, k), completion),
+            *(journey, pose, made, every),
+            *(with_members(seen, made, singles, row, every, k), completion),
             first=n,
         )
         for k, (journey, pose, made, seen) in enumerate(drives)
@@ -157,45 +141,27 @@ def with_vouched(
     return AssociatedSigns(every[kept], left, associations, completed)
 
 
-def _with_singles(
-    association: Association, tracklets: Tracklets, singles: Signs, first: int, number: int
+def with_members(
+    association: Association,
+    tracklets: Tracklets,
+    members: Signs,
+    label: Int[Tensor, " n"],
+    heads: Signs,
+    number: int,
 ) -> Association:
-    """The association of the `number`-th journey in which its single signs, rows from `first` on, have their tracklets."""
-    mine = torch.nonzero(singles.journey == number)[:, 0]
-    row = torch.full((tracklets.count + 1,), -1, device=mine.device)
-    row[singles.tracklet[mine]] = first + mine
-    own = row[tracklets.label]  # label -1 reads the last slot, which stays -1
-    fresh = (association.sign < 0) & (own >= 0)
-    assert tracklets.shift is not None
+    """The association of the `number`-th journey whose detections without a sign show the head of their tracklet's sign."""
+    head, shift = shown_by_members(tracklets, members, label, heads, number)
+    fresh = (association.sign < 0) & (head >= 0)
+    sign = torch.where(fresh, head, association.sign)
     return replace(
-        association,
-        sign=torch.where(fresh, own, association.sign),
-        sign_shift=torch.where(fresh, tracklets.shift, association.sign_shift),
+        association, sign=sign, sign_shift=torch.where(fresh, shift, association.sign_shift)
     )
 
 
-def member_association(
-    journey: Journey, tracklets: Tracklets, crowd: Crowd, number: int
-) -> Association:
-    """The head that every sign detection of the `number`-th journey shows, and how its corners are turned against it.
-
-    Detections show the head of the cluster that the sign of their tracklet is in.
-    """
-    assert tracklets.shift is not None
-    mine = torch.nonzero(crowd.members.journey == number)[:, 0]
-    row_of_tracklet = torch.full((tracklets.count + 1,), -1, device=mine.device)
-    row_of_tracklet[crowd.members.tracklet[mine]] = mine
-    # Label -1 reads the last slot, which stays -1.
-    member = row_of_tracklet[tracklets.label]
-    found = member >= 0
-    head = member.masked_scatter(found, crowd.label[member[found]])
-    used = torch.nonzero(head >= 0)[:, 0]
-    shift = torch.zeros_like(head)
-    of_member, of_head = crowd.members[member[used]], crowd.heads[head[used]]
-    count = polygon.corner_count(of_head.shape)
-    turn, _ = polygon.best_shift(of_head.corners_world, of_member.corners_world, count)
-    shift[used] = (turn + tracklets.shift[used]) % count
-    return Association(sign=head, sign_shift=shift, lane=torch.full_like(journey.lanes.row, -1))
+def no_association(journey: Journey) -> Association:
+    """The association of a journey whose detections show nothing."""
+    none, no_lane = (torch.full_like(found.row, -1) for found in (journey.signs, journey.lanes))
+    return Association(sign=none, sign_shift=torch.zeros_like(none), lane=no_lane)
 
 
 def complete_tracks(
@@ -288,6 +254,48 @@ def without_strayed(
         return None
     left = after.heads[~goes], without_signs(after.associations, goes)
     return _associated_anew(journeys, poses, tracklets, *left, after.tentative, completion, trusted)
+
+
+def with_company(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    tracklets: Sequence[Tracklets],
+    found: AssociatedSigns,
+    before: Sequence[Association],
+    sure: Sequence[Signs],
+    from_afar: Sequence[Signs],
+    crowd: Crowd,
+    config: CrowdConfig,
+    rules: DuplicateSignConfig,
+    completion: CompleteTracksConfig,
+    trusted: Bool[Tensor, " j"],
+) -> AssociatedSigns | None:
+    """What is `found` with those signs of single journeys that are `in_company` by adjusted `poses`; None if there are none.
+
+    Signs `from_afar` say that `sure` ones of other journeys are one, and are none of the map themselves. What showed a sign
+    `before` that is none is not looked at again.
+    """
+    own = signs_of_crowd(sure, from_afar, config.min_journeys)
+    least, n = min(config.min_journeys, len(journeys)), len(found.heads)
+    sound = torch.cat(crowd.trusted_frames(journeys))[frame_number(journeys, own)]
+    sound &= still_alone(own, tracklets, before) & still_alone(own, tracklets, found.associations)
+    alone = own[sound]
+    placed = placed_by(alone, journeys, poses)
+    alone = replace(alone, T_world_sign=placed.T_world_sign)
+    into = in_company(alone, placed.view_position, found.heads, least, rules.company)
+    new, label = torch.unique(torch.cat((into.new_tensor([-1]), into)), return_inverse=True)
+    if least < 2 or len(new) == 1:
+        return None
+    every, label = concatenate([found.heads, alone[new[1:]]]), label[1:] - 1
+    label = torch.where(label < 0, label, n + label)
+    drives = zip(tracklets, found.associations, strict=True)
+    shown = [with_members(a, t, alone, label, every, k) for k, (t, a) in enumerate(drives)]
+    given = journeys, poses, tracklets, every, shown, found.tentative, completion, trusted
+    more = _associated_anew(*given)
+    passed = passing_of(every[n:], crowd.members, crowd.label, crowd.report.n_passing)
+    likely = existence(more.heads.n_journeys[n:], passed, config.existence).to(every.confidence)
+    confidence = torch.cat((found.heads.confidence, likely))
+    return replace(more, heads=replace(more.heads, confidence=confidence))
 
 
 def join_duplicates(

@@ -15,6 +15,7 @@ from crowdmap_torch.ranges import (
     Settings,
     Share,
 )
+from crowdmap_torch.tables import Association, Signs
 
 
 @dataclass(frozen=True)
@@ -50,3 +51,26 @@ class CompleteTracksConfig(Settings):
     """What was found tells how the projections of other detections err."""
     evidence: Count = 3
     """Journeys with so many detections of a sign have seen it."""
+
+
+@dataclass(frozen=True)
+class CompletedTracks:
+    """The associations with what was brought back, and how much that is."""
+
+    associations: tuple[Association, ...]
+    fitting: int
+    """Detections that lie on the projection of their sign."""
+    displaced: int
+    """Detections of the right size and shape beside it, while nothing else shows it."""
+
+
+@dataclass(frozen=True)
+class AssociatedSigns:
+    """The signs of the first map, and which of them each detection shows."""
+
+    heads: Signs
+    tentative: Signs
+    """Signs that too few journeys saw."""
+    associations: tuple[Association, ...]
+    completed: CompletedTracks | None
+    """What clustering had set aside and was given back; None with `paper2017`, which does not."""

@@ -22,6 +22,7 @@ from crowdmap_torch.clustering.groups import (
     rows_of_ranges,
 )
 from crowdmap_torch.clustering.neighbours import near_pairs
+from crowdmap_torch.crowd_signs.company import CompanyConfig
 from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance, sign_distance
 from crowdmap_torch.crowd_signs.merge import mutual_partners
@@ -56,6 +57,8 @@ class DuplicateSignConfig(Settings):
     """Signs that a sign is compared with, the nearest."""
     similarity: SimilarityConfig = field(default_factory=SimilarityConfig)
     """What differences of appearance cost."""
+    company: CompanyConfig = field(default_factory=CompanyConfig)
+    """When signs that single drives saw are one."""
 
 
 def duplicate_signs(

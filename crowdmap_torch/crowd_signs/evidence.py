@@ -11,6 +11,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.groups import cheapest, distinct_pairs, group_count
 from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.projections import Candidates, ProjectionErrors
+from crowdmap_torch.geometry import polygon
 from crowdmap_torch.tables import Association, Journey, Signs, Tracklets
 
 _USUAL = 2.0
@@ -30,6 +31,28 @@ def of_its_shape(association: Association, journey: Journey, signs: Signs) -> In
     shown = association.sign
     alike = journey.signs.shape == signs.shape[shown.clamp_min(0)]
     return shown.masked_fill(~alike, -1)
+
+
+def shown_by_members(
+    tracklets: Tracklets, members: Signs, label: Int[Tensor, " n"], heads: Signs, number: int
+) -> tuple[Int[Tensor, " d"], Int[Tensor, " d"]]:
+    """The head that every detection of the `number`-th journey shows, -1: none, and how its corners are turned against it.
+
+    It is the one of the `heads` that the sign of its tracklet, one of the `members`, has for its `label`.
+    """
+    mine = torch.nonzero(members.journey == number)[:, 0]
+    row_of_tracklet = torch.full((tracklets.count + 1,), -1, device=mine.device)
+    row_of_tracklet[members.tracklet[mine]] = mine
+    member = row_of_tracklet[tracklets.label]  # label -1 reads the last slot, which stays -1
+    found = member >= 0
+    head = member.masked_scatter(found, label[member[found]])
+    used = torch.nonzero(head >= 0)[:, 0]
+    of_member, of_head = members[member[used]], heads[head[used]]
+    count = polygon.corner_count(of_head.shape)
+    turn, _ = polygon.best_shift(of_head.corners_world, of_member.corners_world, count)
+    assert tracklets.shift is not None
+    shift = torch.zeros_like(head).index_put((used,), (turn + tracklets.shift[used]) % count)
+    return head, shift
 
 
 def shown_by_trusted(

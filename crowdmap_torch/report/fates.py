@@ -15,7 +15,7 @@ from crowdmap_torch.io.detections import DROPPED_LANE, DROPPED_SIGN
 from crowdmap_torch.lanes import reconstruct
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.plausibility.finding import Finding
-from crowdmap_torch.signs import triangulate
+from crowdmap_torch.signs import pruning
 from crowdmap_torch.tables import Dataset
 
 MAPPED = "in the map"
@@ -110,7 +110,7 @@ def sign_fates_by_row(
         zip(dataset.journeys, result.journey_maps, result.associations, strict=True)
     ):
         yield _fates(
-            *(made.sign_tracklets.label, made.sign_report.reason, triangulate.REASONS),
+            *(made.sign_tracklets.label, made.sign_report.reason, pruning.REASONS),
             *(found.sign, is_certain, trusted[number][journey.signs.frame], number in outliers),
         )
 

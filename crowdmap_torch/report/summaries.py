@@ -108,13 +108,14 @@ def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict
         "sign tracklets": sum(m.sign_tracklets.count for m in maps),
         "signs of single journeys": sum(len(m.signs) for m in maps),
         "lane pieces of single journeys": sum(len(m.lanes) for m in maps),
-        "sign clusters": len(first.signs) + first.joined,
+        "sign clusters": len(first.signs) + first.joined - first.found_later,
         "single signs": len(first.tentative),
         "sign detections brought back": first.completed.fitting + first.completed.displaced
         if first.completed
         else 0,
         "adjustments begun again": first.anew,
         "signs joined or gone after the adjustment": first.joined,
+        "signs found by adjusted poses": first.found_later,
         "sign detections used": sum(int((a.sign >= 0).sum()) for a in result.associations),
         "lane detections used": sum(int((a.lane >= 0).sum()) for a in result.associations),
         "control points": result.control_points,

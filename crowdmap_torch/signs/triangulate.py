@@ -2,108 +2,33 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.groups import group_argmin, group_mode, group_sum
-from crowdmap_torch.geometry import camera, polygon, se3
+from crowdmap_torch.clustering.groups import group_mode, group_sum
+from crowdmap_torch.geometry import camera, polygon
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.noise.white_noise import with_white_noise
-from crowdmap_torch.optim.robust import usual
-from crowdmap_torch.ranges import (
-    Count,
-    Degrees,
-    Deviations,
-    Factor,
-    Length,
-    Settings,
-    Share,
-    Sigma,
-    Span,
-)
 from crowdmap_torch.residuals.sign_prior import against_the_drive
 from crowdmap_torch.road.nonholonomic import DrivePath, drive_path
-from crowdmap_torch.signs.fit import SignFitConfig, fit_signs
+from crowdmap_torch.signs.fit import fit_signs
 from crowdmap_torch.signs.fit_alone import center_axis_size, fit_signs_alone, mid_points
-from crowdmap_torch.signs.initialize import (
-    SignStartConfig,
-    choose_starts_again,
-    choose_starts_of_drive,
+from crowdmap_torch.signs.initialize import choose_starts_again, choose_starts_of_drive
+from crowdmap_torch.signs.merge_tracks import rejoin, relabelled
+from crowdmap_torch.signs.pruning import (
+    FEW_FRAMES,
+    KEPT,
+    REASONS,
+    REJOINED,
+    SignTriangulationConfig,
+    fates,
+    fates_alone,
 )
-from crowdmap_torch.signs.merge_tracks import RejoinConfig, rejoin, relabelled
 from crowdmap_torch.signs.views import SignFit, SignStart, SignViews, distance_away
 from crowdmap_torch.tables import Journey, Signs, Tracklets
-
-METHODS = ("joint", "paper2017")
-REASONS = (
-    "kept",
-    "too few frames",
-    "too little parallax",
-    "too far away",
-    "behind the camera",
-    "residual too large",
-    "position too uncertain",
-    "implausible size",
-    "rejoined with another tracklet",
-)
-"""What becomes of a tracklet, by code."""
-KEPT, FEW_FRAMES, NO_PARALLAX, TOO_FAR, BEHIND, RESIDUAL, UNCERTAIN, SIZE, REJOINED = range(9)
-_VIEWS_BESIDE = 20.0
-"""Views in long tracklets that count beside those of a drive: a few short runs may be all that a drive without signs has."""
-
-
-@dataclass(frozen=True)
-class SignTriangulationConfig(Settings):
-    """How tracklets become signs, and which do not (IV-B)."""
-
-    method: str = "joint"
-    """`joint`: all signs and the drift of the poses as one problem, several starts, fragments rejoined. `paper2017`: each
-    sign by itself (`signs.fit_alone`), kept where its views see it from different enough angles."""
-    min_frames: Count = 3
-    """Tracklets with fewer detections of the tracklet's shape are pruned."""
-    min_parallax_alone_deg: Degrees = 10.0
-    """`paper2017`: tracklets whose rays differ by less are pruned; what drifts between the views moves signs fitted one by
-    one the further the less they differ."""
-    min_parallax_deg: Degrees = 0.7
-    """`joint`, as all that follows: tracklets whose rays differ by less are pruned."""
-    max_distance_m: Length = 80.0
-    """Tracklets whose closest view is further away are pruned."""
-    max_noise_scale: Deviations = 3.9
-    """Tracklets whose views are noisier, as a multiple of the noise expected, or of that of the drive, are pruned."""
-    min_inlier_share: Share = 0.5
-    """Tracklets of whose views fewer agree with the sign are pruned."""
-    max_sigma_m: Sigma = 1.5
-    """Tracklets whose centre has a larger standard deviation in any direction are pruned."""
-    doubtful_frames: Count = 10
-    """Tracklets with fewer views in agreement must be better placed than others, unless a drive's signs are seen hardly any
-    longer: false detections come in short runs."""
-    max_doubtful_sigma_m: Sigma = 0.5
-    """Largest standard deviation of those; others are none of this journey's, and of the map where two journeys show one."""
-    size_m: Span = (0.1, 16.5)
-    """Of both methods: smallest and largest plausible width and height. A board above four lanes of 3.75 m is 15 m wide, and
-    what is found of it may be a tenth more."""
-    min_side_m: Length = 0.25
-    """Smallest plausible larger side: false detections that slide through the image of a creeping car look like tiny
-    plates before the lens."""
-    confident_frames: Factor = 4.0
-    """Views in agreement, weighted by their scores, at which the confidence reaches 1 - 1/e."""
-    start: SignStartConfig = field(default_factory=SignStartConfig)
-    """Where the fits begin."""
-    rejoin: RejoinConfig = field(default_factory=RejoinConfig)
-    """When tracklets are put together again after a gap."""
-    fit: SignFitConfig = field(default_factory=SignFitConfig)
-    """The minimisation."""
-
-    def __post_init__(self) -> None:
-        """Refuses an unknown method."""
-        super().__post_init__()
-        if self.method not in METHODS:
-            raise ValueError(f"method: expected one of {METHODS}, found {self.method!r}")
 
 
 @dataclass(frozen=True)
@@ -118,6 +43,8 @@ class SignReport:
     """Mean square whitened error of every detection that was used; NaN for the others."""
     doubtful: Signs
     """Those pruned for few views and no better place: they count where other journeys show them too."""
+    from_afar: Signs
+    """Those pruned for their distance or place alone: rays to a sign, if another journey has one there."""
 
     @property
     def pruned(self) -> dict[str, int]:
@@ -145,7 +72,7 @@ def triangulate_signs(
     rows = rows[reason[tracklets.label[rows]] == KEPT]
     if not len(rows):
         none = _no_signs(journey)
-        return none, SignReport(reason, tracklets, _per_detection(journey), none)
+        return none, SignReport(reason, tracklets, _per_detection(journey), none, none)
     positioning = with_white_noise(positioning, journey)
     label, sign = tracklets.label[rows].unique(return_inverse=True)
     seen = _Seen(tracklets, label, rows, views_of(journey, tracklets, rows, sign))
@@ -155,15 +82,15 @@ def triangulate_signs(
     fitted = fit_method(journey, seen, shape, drive, positioning, config)
     seen, fit, label, views = fitted.seen, fitted.fit, fitted.seen.label, fitted.seen.views
     reason[fitted.rejoined] = REJOINED
-    if is_alone:
-        fate, doubtful = _fates_alone(views, fit, config), torch.zeros_like(label, dtype=torch.bool)
-    else:
-        fate, doubtful = _fates(views, fit, fitted.noise_scale, config)
-    reason[label] = fate
+    of = fates_alone(views, fit, config)
+    if not is_alone:
+        of = fates(views, fit, fitted.noise_scale, config)
+    reason[label] = of.reason
     signs, turn = _signs(journey, seen.rows, views, fit, shape[label], label, config)
     error_sq = _per_detection(journey).index_put((seen.rows,), fit.error_sq)
     tracklets = _turned(journey, seen.tracklets, shape, label, turn)
-    return signs[fate == KEPT], SignReport(reason, tracklets, error_sq, signs[doubtful])
+    pruned = signs[of.doubtful], signs[of.from_afar]
+    return signs[of.reason == KEPT], SignReport(reason, tracklets, error_sq, *pruned)
 
 
 @dataclass(frozen=True)
@@ -294,80 +221,6 @@ def _fit(
 ) -> SignFit:
     facing = against_the_drive(views.T_world_camera, views.sign, len(shape))
     return fit_signs(views, shape, start, facing, scale, drive, positioning, config.fit)
-
-
-def _fates(
-    views: SignViews, fit: SignFit, scale: Float[Tensor, " n"], config: SignTriangulationConfig
-) -> tuple[Int[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Whether each sign is kept, or why it is pruned, the first reason; and which are for having few views alone."""
-    n = len(scale)
-    away = distance_away(views, fit)
-    agrees = (fit.error_sq < config.fit.tukey**2).to(scale)
-    number = group_sum(torch.ones_like(agrees), views.sign, n)
-    sigma = torch.linalg.eigvalsh(fit.covariance)[:, -1].clamp_min(0).sqrt()
-    agreeing = group_sum(agrees, views.sign, n)
-    low, high = config.size_m
-    tests = (
-        (BEHIND, _is_behind(views, fit)),
-        (NO_PARALLAX, _parallax(views, fit, agrees > 0) < math.radians(config.min_parallax_deg)),
-        (TOO_FAR, away[group_argmin(away, views.sign)] > config.max_distance_m),
-        (SIZE, ((fit.size < low) | (fit.size > high)).any(-1)),
-        (SIZE, fit.size.amax(-1) < config.min_side_m),
-        (FEW_FRAMES, agreeing < config.min_frames),
-        (RESIDUAL, agreeing < config.min_inlier_share * number),
-        (RESIDUAL, scale > config.max_noise_scale),
-        (UNCERTAIN, ~(sigma < config.max_sigma_m)),
-    )
-    fate = _first_reason(tests)
-    few = agreeing < _least_views(agreeing[fate == KEPT], config.doubtful_frames)
-    doubtful = (fate == KEPT) & few & ~(sigma < config.max_doubtful_sigma_m)
-    return fate.masked_fill(doubtful, UNCERTAIN), doubtful
-
-
-def _least_views(number: Float[Tensor, " n"], most: int) -> float:
-    """So many views make a tracklet of a drive with such numbers no run of false detections, and `most` do anyway.
-
-    Half of those that half of its views come with: a slow camera, or one of few pixels, shows each sign a few times.
-    """
-    return min(most, usual(number, number, assumed=2.0 * most, beside=_VIEWS_BESIDE) / 2)
-
-
-def _fates_alone(
-    views: SignViews, fit: SignFit, config: SignTriangulationConfig
-) -> Int[Tensor, " n"]:
-    """As `_fates`, by the angles that signs are seen at, and of what can be no sign."""
-    every = torch.ones_like(views.sign, dtype=torch.bool)
-    narrow = _parallax(views, fit, every) < math.radians(config.min_parallax_alone_deg)
-    low, high = config.size_m
-    no_sign = ((fit.size < low) | (fit.size > high)).any(-1)
-    return _first_reason(((BEHIND, _is_behind(views, fit)), (NO_PARALLAX, narrow), (SIZE, no_sign)))
-
-
-def _first_reason(tests: Sequence[tuple[int, Bool[Tensor, " n"]]]) -> Int[Tensor, " n"]:
-    """The code of the first test that each sign fails."""
-    fate = torch.full_like(tests[0][1], KEPT, dtype=torch.int64)
-    for code, fails in tests:
-        fate = torch.where((fate == KEPT) & fails, code, fate)
-    return fate
-
-
-def _is_behind(views: SignViews, fit: SignFit) -> Bool[Tensor, " n"]:
-    """True for signs that are behind one of the cameras that saw them, or nowhere."""
-    centre = fit.T_world_sign[views.sign, :3, 3]
-    in_camera = se3.transform(se3.inverse(views.T_world_camera), centre)
-    is_behind = ~(in_camera[:, 2] > 0)
-    return group_sum(is_behind.to(fit.size), views.sign, len(fit.size)) > 0
-
-
-def _parallax(views: SignViews, fit: SignFit, counts: Bool[Tensor, " m"]) -> Float[Tensor, " n"]:
-    """Largest angle between the closest view's ray to a sign and the rays of the views that count [rad]."""
-    towards = views.p_world_camera - fit.T_world_sign[views.sign, :3, 3]
-    ray = torch.nn.functional.normalize(towards, dim=-1)
-    closest = group_argmin(towards.norm(dim=-1), views.sign)
-    across = torch.linalg.cross(ray, ray[closest][views.sign]).norm(dim=-1)
-    angle = torch.atan2(across, (ray * ray[closest][views.sign]).sum(-1))
-    angle = torch.where(counts, angle, torch.zeros_like(angle))
-    return torch.zeros_like(fit.size[:, 0]).scatter_reduce(0, views.sign, angle, "amax")
 
 
 def _signs(

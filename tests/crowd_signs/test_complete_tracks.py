@@ -25,14 +25,16 @@ from worlds.sign_drive import (
 )
 
 from crowdmap_torch.crowd_signs.complete_tracks import (
-    AssociatedSigns,
-    CompletedTracks,
     complete_tracks,
     with_evidence,
     with_vouched,
     without_signs,
 )
-from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
+from crowdmap_torch.crowd_signs.completion import (
+    AssociatedSigns,
+    CompletedTracks,
+    CompleteTracksConfig,
+)
 from crowdmap_torch.crowd_signs.duplicates import duplicate_signs
 from crowdmap_torch.crowd_signs.existence import still_alone
 from crowdmap_torch.crowd_signs.register import CrowdConfig

@@ -21,13 +21,12 @@ from worlds.sign_drive import (
     with_rows,
 )
 
-from crowdmap_torch.crowd_signs.complete_tracks import (
+from crowdmap_torch.crowd_signs.complete_tracks import join_duplicates, without_strayed
+from crowdmap_torch.crowd_signs.completion import (
     AssociatedSigns,
     CompletedTracks,
-    join_duplicates,
-    without_strayed,
+    CompleteTracksConfig,
 )
-from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, may_be_one, seen_together
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.tables import Association, Journey, Signs

@@ -22,7 +22,8 @@ from crowdmap_torch.noise.pose_prior import PosePriorConfig, pose_prior
 from crowdmap_torch.noise.positioning import DriftPathConfig, PositioningNoise, drift_terms
 from crowdmap_torch.road.estimate import RoadConfig, estimate_road
 from crowdmap_torch.road.nonholonomic import NonholonomicConfig, drive_path
-from crowdmap_torch.signs.triangulate import SignTriangulationConfig, triangulate_signs
+from crowdmap_torch.signs.pruning import SignTriangulationConfig
+from crowdmap_torch.signs.triangulate import triangulate_signs
 from crowdmap_torch.tracking.sign_features import SignAssociationConfig
 from crowdmap_torch.tracking.signs import SignAssociator, associate_signs
 

@@ -28,7 +28,7 @@ from crowdmap_torch.report.fates import (
     missing_findings,
     sign_fates,
 )
-from crowdmap_torch.signs import triangulate
+from crowdmap_torch.signs import pruning
 from crowdmap_torch.tables import Association, Dataset
 
 CONFIG = MapperConfig()
@@ -121,7 +121,7 @@ def test_an_empty_map_is_told_with_a_count_for_every_reason(
 
 
 def test_every_fate_that_is_explained_exists() -> None:
-    tracks = {f"in a track: {why}" for why in (*triangulate.REASONS, *reconstruct.REASONS)}
+    tracks = {f"in a track: {why}" for why in (*pruning.REASONS, *reconstruct.REASONS)}
     others = {NO_TRACK, OUTLIER_JOURNEY, OUTAGE, TOO_FEW_JOURNEYS, IMPROBABLE}
     others.add(f"dropped at the door: {OUTSIDE}")
     assert _WHY.keys() <= tracks | others

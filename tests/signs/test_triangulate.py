@@ -24,16 +24,15 @@ from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.noise.positioning import PositioningNoise
-from crowdmap_torch.signs.triangulate import (
+from crowdmap_torch.signs.pruning import (
     FEW_FRAMES,
     KEPT,
     NO_PARALLAX,
     REASONS,
     REJOINED,
-    SignReport,
     SignTriangulationConfig,
-    triangulate_signs,
 )
+from crowdmap_torch.signs.triangulate import SignReport, triangulate_signs
 from crowdmap_torch.tables import Dataset, Journey, Signs, SurveySigns, Tracklets
 from crowdmap_torch.tracking.sign_features import SignAssociationConfig
 from crowdmap_torch.tracking.signs import associate_signs
@@ -294,6 +293,36 @@ def test_signs_that_are_seen_a_few_times_each_are_mapped():
     assert report.pruned["kept"] == len(signs) == len(places) - 1
     # It is no sign of this drive's, but may be one of other drives'.
     assert report.doubtful.tracklet.tolist() == [3]
+
+
+def test_signs_that_are_only_seen_from_afar_are_rays_to_those_of_others():
+    """Too far away, or placed too badly, for a sign of this drive; too short a run tells nothing of others either."""
+    places = [(3.5 * (-1) ** i, 60.0 + 25.0 * i, 2.5) for i in range(8)]
+    drive = drive_past(
+        straight_poses(320), signs_at(places, yaw_deg=8.0), noise_px=1.0, depth_m=(20.0, 100.0)
+    )
+    depth = drive.T_world_sign[drive.sign, 1, 3] - 0.8 * drive.journey.signs.frame
+    far = with_rows(drive, ((drive.sign != 3) | (depth > 70.0)).nonzero()[:, 0])
+    narrow = replace(CONFIG, max_distance_m=60.0)
+    signs, report = triangulate_signs(far.journey, by_truth(far), NOISE, narrow)
+    assert REASONS[int(report.reason[3])] == "too far away"
+    assert report.from_afar.tracklet.tolist() == [3] and len(report.doubtful) == 0
+    off = report.from_afar.center_world[0] - far.T_world_sign[3, :3, 3]
+    assert float(off[[0, 2]].norm()) < 0.3
+    # As near as that it is allowed to be, but no better placed than it is.
+    sigma = float(torch.linalg.eigvalsh(report.from_afar.covariance[0])[-1].sqrt())
+    strict = replace(CONFIG, max_sigma_m=sigma / 2)
+    signs, report = triangulate_signs(far.journey, by_truth(far), NOISE, strict)
+    assert REASONS[int(report.reason[3])] == "position too uncertain"
+    assert 3 in report.from_afar.tracklet and 3 not in signs.tracklet
+    stricter = replace(strict, max_afar_sigma_m=sigma / 2)
+    _, report = triangulate_signs(far.journey, by_truth(far), NOISE, stricter)
+    assert 3 not in report.from_afar.tracklet
+    # Four views of it beside signs that are seen for hundreds of frames.
+    glance = (far.sign != 3) | (far.journey.signs.frame % 9 == 0)
+    short = with_rows(far, glance.nonzero()[:, 0])
+    _, report = triangulate_signs(short.journey, by_truth(short), NOISE, narrow)
+    assert int((short.sign == 3).sum()) <= 5 and not len(report.from_afar)
 
 
 def test_a_standing_car_maps_nothing_new():
