@@ -55,13 +55,25 @@ def install(package: str) -> None:
         def decorated(made: Any) -> Any:
             if "<locals>" in made.__qualname__:
                 return made
-            return _at_first(made, outermost) if type(made) is FunctionType else outermost(made)
+            return (
+                _at_first(made, outermost) if type(made) is FunctionType else _made(made, outermost)
+            )
 
         return decorated
 
     # What is imported looks the decorator up by this name.
     setattr(jaxtyping, "jaxtyped", jaxtyped)  # noqa: B010
     jaxtyping.install_import_hook(package, "shape_checks.checked")
+
+
+def _made(kind: Any, checks: Callable[[Any], Any]) -> Any:
+    """A dataclass of which the first ones that are made are checked."""
+    plain = kind.__init__
+    kind = checks(kind)
+    looked_at = kind.__init__
+    if looked_at is not plain:
+        kind.__init__ = _at_first(plain, lambda _: looked_at)
+    return kind
 
 
 def _at_first(
