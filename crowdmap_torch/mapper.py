@@ -48,6 +48,7 @@ from crowdmap_torch.io.stored_drives import StoredDrive
 from crowdmap_torch.lanes.reconstruct import LaneReport, reconstruct_lanes
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.optim.levenberg_marquardt import LmState
+from crowdmap_torch.processes.memory import large_tensors_again
 from crowdmap_torch.processes.progress import ProgressCall, silent
 from crowdmap_torch.processes.threads import one_core_each
 from crowdmap_torch.processes.workers import Call
@@ -194,6 +195,7 @@ def map_journeys(
     return tuple(maps[number] for number in range(total))
 
 
+@large_tensors_again()
 @one_core_each()
 @torch.no_grad()
 def map_journey(

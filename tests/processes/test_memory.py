@@ -115,3 +115,40 @@ def test_what_was_freed_is_taken_again_where_it_is_told_to():
 
     # 54 MB are cleared by the system once, or ten times.
     assert faults("together") < faults() / 3
+
+
+_LARGE = """
+import ctypes, resource, sys
+from contextlib import nullcontext
+from crowdmap_torch.processes.memory import keep_in_one_place, large_tensors_again
+keep_in_one_place()
+c = ctypes.CDLL(None)
+c.malloc.restype = ctypes.c_void_p
+c.malloc.argtypes = [ctypes.c_size_t]
+c.free.argtypes = [ctypes.c_void_p]
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+def rounds():
+    begun = faults()
+    for _ in range(10):
+        block = c.malloc(100 << 20)
+        ctypes.memset(block, 1, 100 << 20)
+        c.free(block)
+    return faults() - begun
+before = resident()
+with large_tensors_again():
+    inside, held = rounds(), resident() - before
+print(inside, held, resident() - before, rounds())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to")
+def test_large_tensors_take_what_was_freed_inside_and_hand_it_back_at_the_end():
+    command = [sys.executable, "-c", _LARGE]
+    made = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    inside, held, left, outside = map(int, made.split())
+    # 100 MB are cleared once, or ten times; they stay inside alone.
+    assert inside < outside / 3
+    assert held > 90e6 and left < 10e6
