@@ -165,6 +165,14 @@ def cluster_graph(
     )
 
 
+def singles_behind(label: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
+    """Labels in which every row that has none has one of its own, behind all others."""
+    if not len(label):
+        return label
+    is_single = label < 0
+    return torch.where(is_single, int(label.max()) + is_single.cumsum(0), label)
+
+
 def renumber(label: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
     """The same partition with labels 0, 1, ... in the order of their first member; negative labels stay -1."""
     used = label >= 0

@@ -18,6 +18,7 @@ from torch import Tensor
 from crowdmap_torch.clustering.assignment import match_slots
 from crowdmap_torch.clustering.groups import cheapest, group_count
 from crowdmap_torch.clustering.neighbours import cross_pairs, near_pairs
+from crowdmap_torch.clustering.spectral import singles_behind
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, sign_distance
 from crowdmap_torch.crowd_signs.gather import with_covariance
 from crowdmap_torch.geometry import se3
@@ -78,12 +79,11 @@ def passing_of(
 
     `n_passing` has them by cluster, and behind the clusters by each member without one.
     """
-    is_single = label < 0
-    place = torch.where(is_single, len(n_passing) - int(is_single.sum()) - 1, label)
-    place = place + is_single.cumsum(0) * is_single
     span = int(torch.cat((members.tracklet, signs.tracklet)).max()) + 1 if len(signs) else 1
     key, order = (members.journey * span + members.tracklet).sort()
-    return n_passing[place[order[torch.searchsorted(key, signs.journey * span + signs.tracklet)]]]
+    return n_passing[
+        singles_behind(label)[order[torch.searchsorted(key, signs.journey * span + signs.tracklet)]]
+    ]
 
 
 def in_company(

@@ -275,8 +275,10 @@ def with_company(
     Signs `from_afar` say that `sure` ones of other journeys are one, and are none of the map themselves. What showed a sign
     `before` that is none is not looked at again.
     """
-    own = signs_of_crowd(sure, from_afar, config.min_journeys)
     least, n = min(config.min_journeys, len(journeys)), len(found.heads)
+    if least < 2:
+        return None
+    own = signs_of_crowd(sure, from_afar, least)
     sound = torch.cat(crowd.trusted_frames(journeys))[frame_number(journeys, own)]
     sound &= still_alone(own, tracklets, before) & still_alone(own, tracklets, found.associations)
     alone = own[sound]
@@ -284,7 +286,7 @@ def with_company(
     alone = replace(alone, T_world_sign=placed.T_world_sign)
     into = in_company(alone, placed.view_position, found.heads, least, rules.company)
     new, label = torch.unique(torch.cat((into.new_tensor([-1]), into)), return_inverse=True)
-    if least < 2 or len(new) == 1:
+    if len(new) == 1:
         return None
     every, label = concatenate([found.heads, alone[new[1:]]]), label[1:] - 1
     label = torch.where(label < 0, label, n + label)

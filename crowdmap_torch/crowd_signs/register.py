@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from crowdmap_torch.clustering.spectral import renumber
+from crowdmap_torch.clustering.spectral import renumber, singles_behind
 from crowdmap_torch.crowd_signs.align import AlignConfig, align_journeys, no_bias
 from crowdmap_torch.crowd_signs.cluster import (
     SignClusterConfig,
@@ -365,9 +365,8 @@ def _consolidated(
 ) -> Int[Tensor, " n"]:
     """Labels with small clusters dissolved, duplicate ones joined and signs that were left over brought back."""
     least = min(config.min_journeys, crowd.journeys)
-    if least < 2 and len(label):
-        rest = label < 0
-        label = torch.where(rest, int(label.max()) + rest.cumsum(0), label)
+    if least < 2:
+        label = singles_behind(label)
     label = without_small(crowd.signs.journey, label, min_journeys=least, counts=weight > 0)
     together = crowd.seen_together
     sigma = weight.new_full((3,), config.shift_sigmas_m[-1])
@@ -420,9 +419,8 @@ def _finished(
     displaced: Bool[Tensor, " n"] | None = None,
 ) -> Crowd:
     is_single = label < 0
-    every = torch.where(is_single, len(heads) - 1 + is_single.cumsum(0), label)
     count = len(heads) + int(is_single.sum())
-    passing = passing_journeys(crowd, every, count, config.existence)
+    passing = passing_journeys(crowd, singles_behind(label), count, config.existence)
     confidence = existence(heads.n_journeys, passing[: len(heads)], config.existence)
     members = unbiased_signs(crowd, bias)
     tentative = members[is_single]

@@ -137,13 +137,13 @@ def fates(
     )
     reason = _first_reason(tests)
     few = agreeing < _least_views(agreeing[reason == KEPT], config.doubtful_frames)
-    of_place = _first_reason([(code, fails) for code, fails in tests if code not in _OF_PLACE])
+    but_for_place = _first_reason([test for test in tests if test[0] not in _OF_PLACE])
     known = (sigma < config.max_afar_sigma_m) & ~few
     doubtful = (reason == KEPT) & few & ~(sigma < config.max_doubtful_sigma_m)
     return Fates(
         reason=reason.masked_fill(doubtful, UNCERTAIN),
         doubtful=doubtful,
-        from_afar=(reason != KEPT) & (of_place == KEPT) & known,
+        from_afar=(reason != KEPT) & (but_for_place == KEPT) & known,
     )
 
 

@@ -82,8 +82,9 @@ def triangulate_signs(
     fitted = fit_method(journey, seen, shape, drive, positioning, config)
     seen, fit, label, views = fitted.seen, fitted.fit, fitted.seen.label, fitted.seen.views
     reason[fitted.rejoined] = REJOINED
-    of = fates_alone(views, fit, config)
-    if not is_alone:
+    if is_alone:
+        of = fates_alone(views, fit, config)
+    else:
         of = fates(views, fit, fitted.noise_scale, config)
     reason[label] = of.reason
     signs, turn = _signs(journey, seen.rows, views, fit, shape[label], label, config)

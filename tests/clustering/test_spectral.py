@@ -157,6 +157,13 @@ def test_unknown_way_to_label_is_refused():
         SpectralConfig(labels="median")
 
 
+def test_rows_without_a_label_get_one_of_their_own_behind_all_others():
+    label = torch.tensor([1, -1, 0, -1, 1])
+    assert spectral.singles_behind(label).tolist() == [1, 2, 0, 3, 1]
+    assert spectral.singles_behind(torch.tensor([-1, -1])).tolist() == [0, 1]
+    assert spectral.singles_behind(label[:0]).tolist() == []
+
+
 def test_renumber_keeps_the_partition_and_the_pruned():
     label = torch.tensor([7, -1, 3, 7, 0])
     assert spectral.renumber(label).tolist() == [0, -1, 1, 0, 2]

@@ -85,17 +85,21 @@ def test_threads_share_a_heap_where_they_are_told_to(tmp_path):
     assert heaps("together") == 1
 
 
-_AGAIN = """
+_BLOCKS = """
 import ctypes, resource, sys
-from crowdmap_torch.processes.memory import keep_in_one_place
-if "together" in sys.argv:
-    keep_in_one_place()
+from crowdmap_torch.processes.memory import keep_in_one_place, large_tensors_again
 c = ctypes.CDLL(None)
 c.malloc.restype = ctypes.c_void_p
 c.malloc.argtypes = [ctypes.c_size_t]
 c.free.argtypes = [ctypes.c_void_p]
 def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+"""
+"""How many pages the system had to hand out for blocks of the C library."""
+
+_AGAIN = f"""{_BLOCKS}
+if "together" in sys.argv:
+    keep_in_one_place()
 begun = faults()
 for _ in range(10):
     blocks = [c.malloc(18 << 20) for _ in range(3)]
@@ -117,19 +121,10 @@ def test_what_was_freed_is_taken_again_where_it_is_told_to():
     assert faults("together") < faults() / 3
 
 
-_LARGE = """
-import ctypes, resource, sys
-from contextlib import nullcontext
-from crowdmap_torch.processes.memory import keep_in_one_place, large_tensors_again
+_LARGE = f"""{_BLOCKS}
 keep_in_one_place()
-c = ctypes.CDLL(None)
-c.malloc.restype = ctypes.c_void_p
-c.malloc.argtypes = [ctypes.c_size_t]
-c.free.argtypes = [ctypes.c_void_p]
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
-def faults():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 def rounds():
     begun = faults()
     for _ in range(10):
