@@ -21,7 +21,6 @@ from crowdmap_torch.io.documents import write_json
 from crowdmap_torch.io.errors import InputError, input_read
 from crowdmap_torch.io.remote import Place, at_hand, place_of
 from crowdmap_torch.processes.threads import one_core_each
-from crowdmap_torch.report.check import write_check_page
 from crowdmap_torch.report.check_json import check_content
 
 FOUND = 4
@@ -60,6 +59,9 @@ def run(options: argparse.Namespace) -> int:
             if options.fix is not None and any(item.repairs for item in check.items):
                 mended = write_repaired(here, options.fix, check, config)
             if options.html is not None:
+                # Plots are a sixth of what a check imports, and of use on a page alone.
+                from crowdmap_torch.report.check import write_check_page
+
                 write_check_page(options.html, here, check, config)
                 print(f"page: {options.html}")
     if options.json is not None:
