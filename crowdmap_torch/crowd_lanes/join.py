@@ -363,10 +363,11 @@ def _often_enough(
 ) -> tuple[Curves, Match, float]:
     """The curves that are detected often enough, the samples on them, and the length of the others [m].
 
-    What was taken for one of these may lie on another.
+    A piece's detections count as far as they agree where it is. What was taken for one of these curves may lie on another.
     """
     matched = match(line, curves, gate=gate)
-    of_piece = lanes.n_observations / torch.bincount(samples.piece, minlength=len(lanes))
+    detections = lanes.n_observations * lanes.confidence
+    of_piece = detections / torch.bincount(samples.piece, minlength=len(lanes))
     on = matched.curve >= 0
     share = how_often(
         *(matched.curve[on], matched.station[on], line.owner[on]),

@@ -83,6 +83,8 @@ class LaneFit:
     """1-sigma of them across the marker, from the points' noise as it turned out [m]."""
     miss: Float[Tensor, " r"]
     """How far each point is from its piece in the top view, positive to the right [m]."""
+    expected: Float[Tensor, " r"]
+    """1-sigma of that, as it was given [m]."""
     weight: Float[Tensor, " r"]
     """Share of its own weight that a point kept; 0 for outliers."""
 
@@ -313,6 +315,7 @@ def fit_pieces(
         control=spline_basis.from_coefficients_flat(coefficient, count),
         sigma=base.control_sigma(own * kept) * noise.clamp_min(0.5)[spline_basis.rows(count)[0]],
         miss=torch.empty_like(miss).index_put((order,), miss),
+        expected=sigma[pieces.point],
         weight=torch.empty_like(kept).index_put((order,), kept),
     )
 

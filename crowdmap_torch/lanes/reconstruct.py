@@ -90,7 +90,10 @@ class LaneConfig(Settings):
     paper: PaperPieces = field(default_factory=PaperPieces)
     """Method `paper2017`."""
     confident_frames: Factor = 4.0
-    """Detections that a piece needs for its confidence to reach 1 - 1/e."""
+    """Detections that a piece needs for its confidence to reach 1 - 1/e, ..."""
+    usual_misses: Factor = 2.0
+    """... if all its points are no further from it than so many times what is usual of the drive, by what is expected of
+    each: points of a marker agree where it is, those of lines that nobody painted lie anywhere beside one."""
     sigma_m: Sigma = 0.04
     """1-sigma of a piece's lateral error that its points share."""
     height_sigma: Sigma = 0.015
@@ -215,7 +218,7 @@ def reconstruct_lanes(
             fit.control, pieces.control_count, *everything, band=config.band_m, near=config.near_m
         )
         reason, kept = _judged(pieces, fit, sigma, chance, reason, config)
-    lanes = _table(journey, detection, pieces, fit, sigma, config)
+    lanes = _table(journey, detection, pieces, fit, sigma, kept, config)
     miss = fit.miss[kept[pieces.piece] & (fit.weight > 0.1)]
     points = int(kept[pieces.piece].sum())
     report = LaneReport(
@@ -335,6 +338,7 @@ def _table(
     pieces: LanePieces,
     fit: LaneFit,
     sigma: Float[Tensor, " c"],
+    kept: Bool[Tensor, " n"],
     config: LaneConfig,
 ) -> Lanes:
     """The pieces as lanes, with what is known of them; `detection` is that of each point."""
@@ -343,8 +347,7 @@ def _table(
     first, last = group_range(frame, pieces.piece, n)
     of_piece, sighting, _ = distinct_pairs(pieces.piece, detection[pieces.point])
     observations = torch.bincount(of_piece, minlength=n)
-    inliers = group_sum((fit.weight > 0.1).to(fit.weight), pieces.piece, n)
-    share = inliers / torch.bincount(pieces.piece, minlength=n).clamp_min(1)
+    share = _agreeing(pieces, fit, kept, config.usual_misses)
     kind = journey.lanes.type[sighting]
     order = _forward(journey, fit.control, count, first, last)
     return Lanes(
@@ -361,6 +364,17 @@ def _table(
         confidence=share * (1 - torch.exp(-observations / config.confident_frames)),
         control=ControlPoints(fit.control, sigma)[order],
     )
+
+
+def _agreeing(
+    pieces: LanePieces, fit: LaneFit, kept: Bool[Tensor, " n"], most: float
+) -> Float[Tensor, " n"]:
+    """Share of each piece's points that miss it by at most so many times what points of the drive's `kept` pieces do."""
+    miss = (fit.miss / fit.expected).abs()
+    of_kept = miss[kept[pieces.piece]]
+    agrees = miss <= most * (of_kept.median() if len(of_kept) else torch.inf)
+    number = torch.bincount(pieces.piece, minlength=len(pieces)).clamp_min(1)
+    return group_sum(agrees.to(miss), pieces.piece, len(pieces)) / number
 
 
 def _forward(

@@ -134,11 +134,20 @@ def test_wrong_pieces_across_two_markers_make_no_lane() -> None:
     assert figures.recall >= 0.99
 
 
-@pytest.mark.parametrize(("detections", "lanes"), [(6, 2), (16, 3)])
-def test_what_is_detected_now_and_then_beside_markers_is_none(detections: int, lanes: int) -> None:
+@pytest.mark.parametrize(
+    ("detections", "agreeing", "lanes"), [(6, 0.9, 2), (16, 0.9, 3), (16, 0.4, 2), (40, 0.4, 3)]
+)
+def test_what_is_detected_now_and_then_beside_markers_is_none(
+    detections: int, agreeing: float, lanes: int
+) -> None:
     every = lanes_of([(line(0), "solid"), (line(3.5), "solid"), (line(1.6), "dashed")], 6)
-    often = torch.where(every.tracklet == 2, detections, 40)
-    joined = join_lanes(replace(every, n_observations=often), NOISE, CONFIG)
+    is_beside = every.tracklet == 2
+    every = replace(
+        every,
+        n_observations=torch.where(is_beside, detections, 40),
+        confidence=torch.where(is_beside, agreeing, 0.9).to(every.confidence),
+    )
+    joined = join_lanes(every, NOISE, CONFIG)
     assert len(joined.lanes) == lanes
     dropped = 200.0 if lanes == 2 else 0.0
     assert joined.report.seldom_m == pytest.approx(dropped, abs=5.0)

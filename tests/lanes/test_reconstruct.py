@@ -31,6 +31,7 @@ from crowdmap_torch.lanes.reconstruct import (
 )
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.road.estimate import RoadConfig, estimate_road
+from crowdmap_torch.road.ground_projection import project_to_surface
 from crowdmap_torch.tables import Journey, Lanes, RoadEstimate, Tracklets
 
 
@@ -170,6 +171,32 @@ def test_outlier_points_hardly_move_a_piece(
     after = errors(spoilt, truth, suburb)[0].abs().mean()
     assert after < before + 0.02
     assert report.outliers / report.points > 0.08
+
+
+@pytest.mark.parametrize(("aside_m", "least", "most"), [(0.0, 0.7, 1.0), (0.35, 0.0, 0.4)])
+def test_a_line_is_as_certain_as_its_detections_agree_where_it_is(
+    aside_m: float,
+    least: float,
+    most: float,
+    suburb: SimulatedDrives,
+    road: RoadEstimate,
+    generator: torch.Generator,
+) -> None:
+    truth = suburb.truths[0]
+    journey, tracklets = truth.journey, lane_tracklets(truth)
+    points = journey.lane_points
+    marker = int(torch.bincount(tracklets.label[tracklets.label >= 0]).argmax())
+    # Each of this marker's detections lies somewhere beside it, as those do that nobody painted.
+    aside = aside_m * (2 * torch.rand(len(tracklets.label), generator=generator) - 1)
+    aside = torch.where(tracklets.label == marker, aside, 0.0)[points.detection]
+    ideal = points.ideal.clone()
+    ideal[:, 0] += aside / project_to_surface(journey, road).depth
+    journey = replace(journey, lane_points=replace(points, ideal=ideal))
+    found = reconstruct_lanes(journey, tracklets, road, LaneConfig())[0]
+    is_it = found.tracklet == marker
+    assert int(is_it.sum()) > 3
+    assert least < float(found.confidence[is_it].mean()) < most
+    assert float(found.confidence[~is_it].mean()) > 0.7
 
 
 def test_dashes_are_bridged_and_long_silence_is_not(
