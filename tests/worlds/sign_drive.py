@@ -12,9 +12,13 @@ from worlds.small_world import Builder
 from crowdmap_torch.geometry import camera as cameras
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.geometry.camera import Camera
-from crowdmap_torch.signs.triangulate import views_of
+from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.signs.pruning import SignTriangulationConfig
+from crowdmap_torch.signs.triangulate import SignReport, triangulate_signs, views_of
 from crowdmap_torch.signs.views import SignViews
 from crowdmap_torch.tables import Association, Journey, Rig, SignDetections, Signs, Tracklets
+from crowdmap_torch.tracking.sign_features import SignAssociationConfig
+from crowdmap_torch.tracking.signs import associate_signs
 
 F64 = torch.float64
 CAMERA = Camera(
@@ -27,6 +31,10 @@ CAMERA = Camera(
 RIG = Rig("rig", CAMERA, torch.eye(4, dtype=F64), torch.tensor([0.0, 1.0, 0.0], dtype=F64), 1.45)
 R_WORLD_CAMERA = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=F64)
 """A level camera that looks north."""
+ALL_SHAPES = list(range(len(polygon.SHAPES)))
+ALONG_THE_ROAD = [(3.5 * (-1) ** i, 45.0 + 4.0 * i, 2.0 + 0.3 * i) for i in ALL_SHAPES]
+"""A place for a sign of each shape."""
+NOISE = PositioningNoise()
 
 
 @dataclass(frozen=True)
@@ -191,3 +199,29 @@ def two_journeys(
     first = associated(drive, known)
     journeys = [drive.journey, drive.journey]
     return journeys, [j.T_world_camera for j in journeys], [first, replace(first, sign=second)]
+
+
+def mixed_street() -> SignDrive:
+    """A drive past a sign of every shape, half a pixel of noise on its corners."""
+    return drive_past(
+        straight_poses(80), signs_at(ALONG_THE_ROAD, yaw_deg=8.0), shape=ALL_SHAPES, noise_px=0.5
+    )
+
+
+def mapped(journey: Journey) -> tuple[Signs, SignReport]:
+    """The signs of a journey, as they are found by default."""
+    tracklets = associate_signs(journey, NOISE, SignAssociationConfig())
+    return triangulate_signs(journey, tracklets, NOISE, SignTriangulationConfig())
+
+
+def by_truth(drive: SignDrive) -> Tracklets:
+    """Tracklets as the truth has them; shifts from association."""
+    found = associate_signs(drive.journey, NOISE, SignAssociationConfig())
+    return Tracklets(drive.sign, len(drive.T_world_sign), found.shift)
+
+
+def corner_errors(signs: Signs, drive: SignDrive) -> torch.Tensor:
+    """Mean corner error of every true sign against the nearest mapped one [m]."""
+    nearest = torch.cdist(drive.T_world_sign[:, :3, 3], signs.center_world).argmin(-1)
+    difference = signs.corners_world[nearest] - drive.corners_world
+    return difference.norm(dim=-1).mean(-1)
