@@ -11,7 +11,6 @@ from worlds.sign_drive import (
     ALONG_THE_ROAD,
     F64,
     NOISE,
-    SignDrive,
     by_truth,
     corner_errors,
     drive_past,
@@ -33,11 +32,6 @@ from crowdmap_torch.signs.pruning import (
 from crowdmap_torch.signs.triangulate import triangulate_signs
 
 CONFIG = SignTriangulationConfig()
-
-
-@pytest.fixture(scope="module")
-def street() -> SignDrive:
-    return mixed_street()
 
 
 def test_signs_fitted_one_by_one_need_more_parallax():
@@ -63,7 +57,8 @@ def test_an_unknown_method_is_refused():
         SignTriangulationConfig(method="best")
 
 
-def test_few_frames_are_pruned_and_counted(street):
+def test_few_frames_are_pruned_and_counted():
+    street = mixed_street()
     few = (street.journey.signs.frame < 2).nonzero()[:, 0]
     signs, report = mapped(with_rows(street, few).journey)
     assert len(signs) == 0
@@ -85,8 +80,9 @@ def test_a_noisy_detector_costs_no_sign(noise_px: float):
     assert float(corner_errors(signs, drive).mean()) < 0.05 * noise_px
 
 
-def test_a_sign_much_noisier_than_the_others_is_pruned(street):
+def test_a_sign_much_noisier_than_the_others_is_pruned():
     """It would be a false one: what is usual follows the others."""
+    street = mixed_street()
     noisy = street.sign == 2
     generator = torch.Generator().manual_seed(5)
     noise = 6.0 * torch.randn(int(noisy.sum()), 8, 2, dtype=F64, generator=generator)
