@@ -16,9 +16,6 @@ CALLS = 10
 _typed = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """Types and shapes of arguments and results; an int will do for a float, as for every type checker."""
 
-_apart = jaxtyping.jaxtyped("context")
-"""Sizes that have a name have it within."""
-
 _files = 0
 """Files of tests that were begun."""
 
@@ -88,9 +85,7 @@ def _at_first(
         if file != _files:
             file, left = _files, CALLS
         if not left:
-            # Sizes that have a name have it in one call only.
-            with _apart:
-                return function(*args, **options)
+            return function(*args, **options)
         left -= 1
         with_checks = with_checks or checks(function)
         return with_checks(*args, **options)

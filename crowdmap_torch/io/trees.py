@@ -45,8 +45,10 @@ def to_tree(value: Any) -> Any:
 def from_tree(kind: Any, tree: Any, *, where: str = "") -> Any:
     """The value of a tree, by its class or other annotation; ValueError names what is not of that kind."""
     if isinstance(kind, type) and issubclass(kind, AbstractArray):
-        if not isinstance(tree, kind):
-            raise ValueError(f"{where}: expected {kind.__name__}, found {_named(tree)}")
+        # Sizes with a name are those of nobody who calls this.
+        with jaxtyped("context"):
+            fits = isinstance(tree, kind)
+        _require(fits, kind.__name__, tree, where)
         return tree
     if is_dataclass(kind):
         return _dataclass_of(kind, tree, where)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, jaxtyped
 from torch import Tensor
 
 from crowdmap_torch.io.trees import digest, from_tree, to_tree
@@ -94,6 +94,13 @@ def test_a_tree_of_something_else_is_refused_by_name(
 ):
     with pytest.raises(ValueError, match=said):
         from_tree(Whole, change(to_tree(whole), path, value))
+
+
+def test_sizes_are_those_of_the_tree_alone(whole: Whole):
+    with jaxtyped("context"):
+        # Rows of who asks are called `n` as well.
+        assert isinstance(torch.zeros(17, 2), Float[Tensor, "n 2"])
+        assert digest(from_tree(Whole, to_tree(whole))) == digest(whole)
 
 
 def test_what_is_no_tree_is_not_kept():
