@@ -162,6 +162,7 @@ def dump(config: MapperConfig) -> str:
     return yaml.safe_dump(as_dict(config), sort_keys=False)
 
 
+@lru_cache(maxsize=64)
 def config_hash(config: MapperConfig) -> str:
     """Twelve hex digits that differ where configurations differ."""
     text = json.dumps(as_dict(config), sort_keys=True)

@@ -225,6 +225,7 @@ def svg(figure: Figure) -> str:
     buffer = io.StringIO()
     with mpl.rc_context(_STYLE):
         figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
+    _keep_places(figure)
     text = buffer.getvalue()
     # Inside a page colours of text and axes are the page's own, and turn with it.
     for color, name in _PAGE_COLORS.items():
@@ -237,6 +238,7 @@ def write_png(figure: Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as beside, mpl.rc_context(_STYLE):
         figure.savefig(beside, format="png", dpi=130)
+    _keep_places(figure)
 
 
 def pixels(figure: Figure) -> UInt8[np.ndarray, "h w 3"]:
@@ -244,7 +246,13 @@ def pixels(figure: Figure) -> UInt8[np.ndarray, "h w 3"]:
     canvas = FigureCanvasAgg(figure)
     with mpl.rc_context(_STYLE):
         canvas.draw()
+    _keep_places(figure)
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _keep_places(figure: Figure) -> None:
+    """What is drawn once more stays where it is: to find out again takes as long as to draw."""
+    figure.set_layout_engine("none")
 
 
 def new_figure(

@@ -46,6 +46,15 @@ def test_every_plot_can_be_an_svg_and_an_image(record):
         assert image.std() > 0
 
 
+def test_a_figure_that_is_drawn_again_looks_the_same(record):
+    for figure in every_plot(record):
+        first = plots.svg(figure)
+        places = [axes.get_position().bounds for axes in figure.axes]
+        plots.pixels(figure)
+        assert [axes.get_position().bounds for axes in figure.axes] == places
+        assert len(plots.svg(figure)) == len(first)
+
+
 def test_a_map_and_drives_are_plotted_and_nothing_else(record: RunRecord, tiny: Dataset):
     (axes,) = plots.plot(record.hd_map, record.survey).axes
     assert axes.get_legend_handles_labels()[1] == ["survey", "map"]
