@@ -24,7 +24,6 @@ from worlds.pages import PAGES, ROOT, Command, bare, said, words_of
 from worlds.programs import begin, checkout
 
 import crowdmap_torch as cm
-from crowdmap_torch.benchmark.browser import browser_path
 from crowdmap_torch.cli import main
 
 NOT_RUN: Mapping[str, str] = {
@@ -56,6 +55,9 @@ ELSEWHERE: Mapping[str, str] = {
     "python scripts/soak.py mutants --seed S --only NUMBER": "tests/soak/test_mutants.py",
     "python scripts/soak.py mutants": "tests/soak/test_mutants.py",
     "python scripts/soak.py kills": "tests/soak/test_interrupted.py",
+    "crowdmap benchmark cluster --sizes 10000 100000 --repeats 1": "tests/benchmark/test_cluster.py",
+    "crowdmap benchmark journey DATASET --endless 4": "tests/benchmark/test_journey.py",
+    "crowdmap benchmark viewer": "tests/benchmark/test_viewer.py",
 }
 """Commands that other tests run."""
 STUDIES, TUTORIAL = "tests/studies/test_study.py", "tests/commands/test_convert.py"
@@ -81,7 +83,6 @@ COMPLETED: Mapping[str, str] = {
     "crowdmap benchmark stages DATASET [--against CHECKOUT ...]": (
         "crowdmap benchmark stages DATA --against 0a43fbe c1332f1"
     ),
-    "crowdmap benchmark viewer": "crowdmap benchmark viewer DATASET --frames 3",
     "crowdmap calibrate": "crowdmap calibrate GARAGE/rig-a --points GARAGE/points.csv --pixels GARAGE/pixels.csv",
     "crowdmap check": "crowdmap check DATASET",
     "crowdmap convert": f"crowdmap convert {CONVERT}",
@@ -122,9 +123,7 @@ SMALLER: Mapping[str, str] = {
     "crowdmap benchmark association": "--workers 1 --methods joint",
     "crowdmap benchmark stages": "--workers 1",
     "crowdmap benchmark bundle": "--sizes 2x6x4 --repeats 1 --solvers ours",
-    "crowdmap benchmark cluster": "--sizes 100",
     "crowdmap benchmark ladybug": "--repeats 1 --solvers ours",
-    "crowdmap benchmark journey DATASET --endless 4": "--endless 0.001",
     "python scripts/soak.py mistakes": "--sets street --only w-x-y-z",
     # A street with six signs, in 13 s; ten worlds take eight minutes.
     "python scripts/soak.py worlds --wide": "--first 40 --count 1",
@@ -139,9 +138,6 @@ OVERWRITE = ("simulate", "optimize", "convert", "view", "export")
 
 def needs(words: list[str]) -> str | None:
     """What a command needs and is not here; None: nothing."""
-    text = " ".join(words)
-    if "benchmark viewer" in text and browser_path() is None:
-        return "a browser"
     for package, option in (("rerun", "--rerun"), ("pyogrio", "geopackage")):
         if option in words and find_spec(package) is None:
             return package

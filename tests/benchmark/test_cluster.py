@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-
 import pytest
 import torch
 
 from crowdmap_torch.benchmark import cluster
+from crowdmap_torch.cli import main
 
 
 def test_the_street_is_as_large_and_as_biased_as_it_says():
@@ -35,9 +34,8 @@ def test_pair_scores_of_a_known_case():
 
 
 def test_the_table_has_a_line_for_each_method(capsys: pytest.CaptureFixture[str]):
-    parser = argparse.ArgumentParser()
-    cluster.add_arguments(parser)
-    cluster.run(parser.parse_args(["--sizes", "300", "--repeats", "1", "--spectral-limit", "100"]))
+    few = ["--sizes", "300", "--repeats", "1", "--spectral-limit", "100"]
+    assert main(["benchmark", "cluster", *few]) == 0
     lines = capsys.readouterr().out.splitlines()
     methods = ["crowdmap_torch", "HDBSCAN", "HDBSCAN, measured"]
     assert all(method in line for method, line in zip(methods, lines[1:], strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import pytest
@@ -10,6 +9,7 @@ import torch
 from worlds.drives import write_tiny
 
 from crowdmap_torch.benchmark import journey as benchmark
+from crowdmap_torch.cli import main
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.single_journey import LANE_STRETCH_FRAMES
@@ -37,11 +37,9 @@ def test_a_repeated_journey_goes_on_where_it_ended(tiny):
 
 
 def test_an_endless_drive_holds_no_more_than_a_stretch(tiny, capsys):
-    parser = argparse.ArgumentParser()
-    benchmark.add_arguments(parser)
     # Several laps of the tiny street.
-    options = parser.parse_args([str(tiny), "--endless", str(40 / 3600), "--rate", "8"])
-    benchmark.run(options)
+    laps = ["--endless", str(40 / 3600), "--rate", "8"]
+    assert main(["benchmark", "journey", str(tiny), *laps]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()[2:]]
     assert len(rows) >= benchmark.REPORTS
     # A stretch of lanes, and half of the one before.
