@@ -133,8 +133,8 @@ class MapResult:
     """Of the signs and lanes of the map, tentative signs left out, and of the journeys' errors."""
     prior_scale: Float[Tensor, "j _"]
     """By journey, how far the sigmas of its bias, drift and rotation were from those given."""
-    white_scale: Float[Tensor, "j 2"]
-    """The same of the noise from frame to frame, of positions and of rotations."""
+    white_scale: Float[Tensor, "j 6"]
+    """The same of the noise from frame to frame, by number of a pose."""
     state: LmState
     control_points: int = 0
     """Surveyed signs that pin the map."""

@@ -55,7 +55,7 @@ class BundleState(nn.Module):
     prior_scale: Tensor
     """By journey, how far bias, drift, rotation and the bias's wander, if any, are from the sigmas of `prior`."""
     white_scale: Tensor
-    """By journey, how far the noise of positions and of rotations from frame to frame is from that of `prior`."""
+    """By journey and number of a pose, how far its noise from frame to frame is from that of `prior`."""
     calibration_scale: Tensor
     """By kind of what cars may have wrong, how far they are from the sigmas of `fleet`."""
     calibration_far: Tensor
@@ -110,7 +110,7 @@ class BundleState(nn.Module):
         self.register_buffer(
             "prior_scale", values["bias"].new_ones(len(values["bias"]), priors.poses.scale_count)
         )
-        self.register_buffer("white_scale", torch.ones_like(values["bias"][:, :2]))
+        self.register_buffer("white_scale", torch.ones_like(values["bias"]))
         self.register_buffer("calibration_scale", self.scale.new_ones(len(self.fleet.kinds)))
         numbers = sum(self.variables[name].tangent_dim for name in self.fleet.variables)
         far = self.scale.new_ones(len(self.fleet.vehicles), numbers)

@@ -21,7 +21,7 @@ from crowdmap_torch.processes.sums import add_at
 _SAMPLED = 8
 """Changes of a journey whose variances are asked for, at most."""
 _WHITE_TRUST = 24.0
-"""Well determined numbers that the noise from frame to frame as it is given counts as."""
+"""Well determined numbers that the noise from frame to frame as it is given counts as, and that of all axes in one's."""
 _WHITE_SCALES = (1.0, MOST_SCALE)
 """Least and largest scale of that noise: narrower than it is given it gains nothing even where it is (docs/RESULTS.md)."""
 
@@ -120,24 +120,37 @@ def white_scales(
     residual: Float[Tensor, "p 6"],
     left: Float[Tensor, "p 6"],
     scale: Float[Tensor, "j _"],
-    white_scale: Float[Tensor, "j 2"],
-) -> Float[Tensor, "j 2"]:
-    """By journey, what the noise of positions and of rotations from frame to frame is to be multiplied by.
+    white_scale: Float[Tensor, "j 6"],
+) -> Float[Tensor, "j 6"]:
+    """By journey and number of a pose, what the noise from frame to frame is to be multiplied by.
 
-    `residual` is the poses' deviation from their drift, in units of their noise at the present scales.
+    `residual` is the poses' deviation from their drift, in units of their noise at the present scales. A receiver's
+    heights tremble more than its places, a camera nods more than it turns: each number has a scale of its own, drawn to
+    that of the three of its kind.
     """
     journey = prior.nodes.journey_of_pose
     within = prior.within_stretch(scale)
-    noise = prior.white_sigma * white_scale.repeat_interleave(3, dim=1)
+    noise = prior.white_sigma * white_scale
     present = noise.square()[journey] + within
     share = (1 - left / present).clamp(0, 1)
 
-    def summed(of_each: Float[Tensor, "p 6"]) -> Float[Tensor, "j 2"]:
-        total = add_at(of_each.new_zeros(len(scale), 6), 0, journey, of_each)
-        return total.view(-1, 2, 3).sum(-1)
+    def summed(of_each: Float[Tensor, "p 6"]) -> Float[Tensor, "j 6"]:
+        return add_at(of_each.new_zeros(len(scale), 6), 0, journey, of_each)
 
-    grown = (summed(residual.square()) + _WHITE_TRUST) / (summed(share) + _WHITE_TRUST)
-    count = 3 * torch.bincount(journey, minlength=len(scale)).clamp_min(1)[:, None]
-    found = grown * summed(present) / count - summed(within) / count
-    given = prior.white_sigma.view(2, 3).square().mean(-1)
-    return (found / given).clamp_min(0).sqrt().clamp(*_WHITE_SCALES)
+    squares, told = summed(residual.square()), summed(share)
+    of_kind = (_of_kinds(squares) + _WHITE_TRUST) / (_of_kinds(told) + _WHITE_TRUST)
+    usual = of_kind.repeat_interleave(3, dim=1)
+    grown = (squares + _WHITE_TRUST * usual) / (told + _WHITE_TRUST)
+    count = torch.bincount(journey, minlength=len(scale)).clamp_min(1)[:, None]
+    found = (grown * summed(present) - summed(within)) / count
+    return (found / prior.white_sigma.square()).clamp_min(0).sqrt().clamp(*_WHITE_SCALES)
+
+
+def white_scales_of_kinds(white_scale: Float[Tensor, "j 6"]) -> Float[Tensor, "j 2"]:
+    """Of scales of noise by number of a pose those of positions and of rotations, root mean squares."""
+    return (_of_kinds(white_scale.square()) / 3).sqrt()
+
+
+def _of_kinds(of_each: Float[Tensor, "j 6"]) -> Float[Tensor, "j 2"]:
+    """Sums over positions and over rotations."""
+    return of_each.view(-1, 2, 3).sum(-1)

@@ -176,13 +176,13 @@ class PosePrior:
         return torch.cat((drift[:, :3] - drift[:, 6:], drift[:, 3:6]), dim=1)
 
     def terms(
-        self, scale: Float[Tensor, "j _"], white_scale: Float[Tensor, "j 2"]
+        self, scale: Float[Tensor, "j _"], white_scale: Float[Tensor, "j 6"]
     ) -> dict[str, CostTerm]:
         """Absolute and relative regularisation of the poses, the sigmas scaled."""
         nodes = self.nodes
         bias, drift = self._scaled(scale)
         bias = bias[self.journeys]
-        noise = self.white_sigma * white_scale.repeat_interleave(3, dim=1)
+        noise = self.white_sigma * white_scale
         white = (noise.square()[nodes.journey_of_pose] + self.within_stretch(scale)).sqrt()
         journey = nodes.journey
         start, far, length = residuals.gauss_markov_start, drift, self.length_m

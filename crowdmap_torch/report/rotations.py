@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.noise.pose_evidence import white_scales_of_kinds
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.tables import Dataset
 
@@ -14,7 +15,8 @@ _CONTRADICTED = 3.0
 
 def rotation_findings(dataset: Dataset, result: MapResult) -> tuple[Finding, ...]:
     """One finding for all journeys whose cameras turned otherwise than their rotations say; none where they fit."""
-    drift, noise = result.prior_scale[:, _ROTATION], result.white_scale[:, 1]
+    drift = result.prior_scale[:, _ROTATION]
+    noise = white_scales_of_kinds(result.white_scale)[:, 1]
     contradicted = ((drift > _CONTRADICTED) | (noise > _CONTRADICTED)).tolist()
     names = [j.journey_id for j, so in zip(dataset.journeys, contradicted, strict=True) if so]
     if not names:

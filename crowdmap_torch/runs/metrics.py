@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import torch
-
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.geometry import polygon
@@ -13,6 +11,7 @@ from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.io.documents import plain
 from crowdmap_torch.mapper import MapResult
 from crowdmap_torch.noise.pooled_scales import LEAST_SCALE, MOST_SCALE
+from crowdmap_torch.noise.pose_evidence import white_scales_of_kinds
 from crowdmap_torch.report.iteration import Iteration
 from crowdmap_torch.report.progress import Progress
 from crowdmap_torch.report.summaries import (
@@ -69,13 +68,15 @@ def metrics_of(
                 "bias_covariance": covariance[:3, :3].flatten(),
                 "heading_deg": s.heading_deg,
                 "heading_sigma_deg": s.heading_sigma_deg,
-                "sigma_scale": _named_scales(scale),
+                "sigma_scale": _named_scales(of_prior, of_noise, kinds),
                 **({} if s.without_it is None else {"without_it": plain(s.without_it)}),
             }
-            for s, covariance, scale in zip(
+            for s, covariance, of_prior, of_noise, kinds in zip(
                 summaries,
                 result.uncertainty.bias_covariance,
-                torch.cat((result.prior_scale, result.white_scale), dim=1).tolist(),
+                result.prior_scale.tolist(),
+                result.white_scale.tolist(),
+                white_scales_of_kinds(result.white_scale).tolist(),
                 strict=True,
             )
         ],
@@ -85,18 +86,20 @@ def metrics_of(
     }
 
 
-def _named_scales(scale: Sequence[float]) -> dict[str, object]:
-    """What the sigmas of a journey's errors were multiplied by, by name; and which of these could not go further."""
-    of_noise = ("noise", "rotation_noise")
-    of_prior = ("bias", "drift", "rotation", "wander")[: len(scale) - len(of_noise)]
-    named = dict(zip((*of_prior, *of_noise), scale, strict=True))
-    bounds = [*(LEAST_SCALE for _ in of_prior), *(0.0 for _ in of_noise)]
-    at_bound = [
-        name
-        for (name, found), least in zip(named.items(), bounds, strict=True)
-        if found <= least * (1 + 1e-6) or found >= MOST_SCALE * (1 - 1e-6)
-    ]
-    return {**named, "at_bound": at_bound}
+def _named_scales(
+    of_prior: Sequence[float], of_noise: Sequence[float], kinds: Sequence[float]
+) -> dict[str, object]:
+    """What the sigmas of a journey's errors were multiplied by, by name; and which of these could not go further.
+
+    `kinds` are root mean squares of scales `of_noise`.
+    """
+    slow = dict(zip(("bias", "drift", "rotation", "wander"), of_prior, strict=False))
+    noise = dict(zip(("noise", "rotation_noise"), kinds, strict=True))
+    at_bound = [name for name, found in slow.items() if found <= LEAST_SCALE * (1 + 1e-6)]
+    largest = {**slow, "noise": max(of_noise[:3]), "rotation_noise": max(of_noise[3:])}
+    at_bound += [name for name, found in largest.items() if found >= MOST_SCALE * (1 - 1e-6)]
+    by_axis = {"noise_by_axis": of_noise[:3], "rotation_noise_by_axis": of_noise[3:]}
+    return {**slow, **noise, **by_axis, "at_bound": at_bound}
 
 
 def _corner_covariances(result: MapResult) -> list[dict[str, object]]:

@@ -183,7 +183,8 @@ def test_metrics_tell_how_sure_corners_and_biases_are(run: Path):
         assert abs(journey["heading_deg"]) < 5 * journey["heading_sigma_deg"]
         scales = dict(journey["sigma_scale"])
         assert set(scales.pop("at_bound")) <= set(scales)
-        assert set(scales) == {"bias", "drift", "rotation", "noise", "rotation_noise"}
+        noise = {f"{kind}{of}" for kind in ("noise", "rotation_noise") for of in ("", "_by_axis")}
+        assert set(scales) == {"bias", "drift", "rotation", *noise}
 
 
 def test_the_report_needs_nothing_else(run: Path):

@@ -16,12 +16,14 @@ def test_nothing_is_said_of_rotations_that_fit(tiny: Dataset, tiny_result: MapRe
 
 
 @pytest.mark.parametrize("row", [0, 1])
-@pytest.mark.parametrize(("table", "column"), [("prior_scale", 2), ("white_scale", 1)])
+@pytest.mark.parametrize(
+    ("table", "columns"), [("prior_scale", slice(2, 3)), ("white_scale", slice(3, 6))]
+)
 def test_the_journeys_are_named(
-    tiny: Dataset, tiny_result: MapResult, row: int, table: str, column: int
+    tiny: Dataset, tiny_result: MapResult, row: int, table: str, columns: slice
 ) -> None:
     scale = getattr(tiny_result, table).clone()
-    scale[row, column] = 6.0
+    scale[row, columns] = 6.0
     (finding,) = rotation_findings(tiny, replace(tiny_result, **{table: scale}))
     assert finding.journeys == (tiny.journeys[row].journey_id,)
     line = finding.line(len(tiny.journeys))

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -95,3 +96,6 @@ def test_scales_that_could_not_go_further_are_named(tiny: Dataset, tiny_result: 
     assert scales[0]["at_bound"] == ["drift", "rotation", "noise"]
     assert scales[0]["drift"] == 0.1 and scales[1]["drift"] == 0.8
     assert all(scale["at_bound"] == [] for scale in scales[1:])
+    assert scales[0]["noise_by_axis"] == [10.0, 1.0, 1.0]
+    assert scales[0]["noise"] == pytest.approx(math.sqrt(102 / 3))
+    assert scales[0]["rotation_noise"] == 1 and scales[0]["rotation_noise_by_axis"] == [1, 1, 1]
