@@ -224,8 +224,8 @@ def svg(figure: Figure) -> str:
     """A figure as an SVG element that can stand inside HTML."""
     buffer = io.StringIO()
     with mpl.rc_context(_STYLE):
+        _lay_out(figure)
         figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
-    _keep_places(figure)
     text = buffer.getvalue()
     # Inside a page colours of text and axes are the page's own, and turn with it.
     for color, name in _PAGE_COLORS.items():
@@ -237,22 +237,24 @@ def write_png(figure: Figure, path: Path) -> None:
     """A figure as an image file, complete or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as beside, mpl.rc_context(_STYLE):
+        _lay_out(figure)
         figure.savefig(beside, format="png", dpi=130)
-    _keep_places(figure)
 
 
 def pixels(figure: Figure) -> UInt8[np.ndarray, "h w 3"]:
     """A figure as an image."""
     canvas = FigureCanvasAgg(figure)
     with mpl.rc_context(_STYLE):
+        _lay_out(figure)
         canvas.draw()
-    _keep_places(figure)
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _keep_places(figure: Figure) -> None:
-    """What is drawn once more stays where it is: to find out again takes as long as to draw."""
-    figure.set_layout_engine("none")
+def _lay_out(figure: Figure) -> None:
+    """Finds once where everything is; a figure that still has this to do is drawn twice wherever it is saved."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def new_figure(
