@@ -7,7 +7,7 @@ import json
 import pickle
 from collections.abc import Mapping
 from dataclasses import asdict
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +81,6 @@ def dataset_name(simulation: SimulationConfig) -> str:
 
 
 @cache
-@lru_cache(maxsize=64)
 def journey_config_hash(config: MapperConfig) -> str:
     """Digits that differ where single journeys are mapped differently."""
     settings = asdict(config.resolved())
