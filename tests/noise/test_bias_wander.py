@@ -77,7 +77,7 @@ def test_a_bias_that_wanders_is_told_from_end_to_end_of_a_short_drive():
 def test_the_prior_of_the_drift_is_bias_and_two_chains():
     prior = make_prior(1, way_m=3000.0, spacing_m=60.0)
     scale = torch.tensor([[1.5, 0.5, 2.0, 3.0]], dtype=F64)
-    terms = prior.terms(scale, torch.ones(1, 2, dtype=F64))
+    terms = prior.terms(scale, torch.ones(1, 6, dtype=F64))
     terms = {name: term for name, term in terms.items() if name != "pose_white"}
     variables = {"drift": Variable(9, euclidean), "bias": Variable(6, euclidean)}
     n, way = len(prior.nodes.way), prior.nodes.way

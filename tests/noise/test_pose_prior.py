@@ -59,7 +59,7 @@ def test_the_prior_of_the_drift_is_bias_and_chain():
     scale = torch.tensor([[1.5, 0.5, 2.0]], dtype=F64)
     terms = {
         k: t
-        for k, t in prior.terms(scale, torch.ones(len(scale), 2, dtype=F64)).items()
+        for k, t in prior.terms(scale, torch.ones(len(scale), 6, dtype=F64)).items()
         if k != "pose_white"
     }
     variables = {name: Variable(6, euclidean) for name in ("drift", "bias")}
@@ -191,7 +191,7 @@ def test_what_all_journeys_share_errs_as_much_as_the_expected_scales_say(journey
 
 def test_poses_of_the_prior_cost_nothing():
     prior = make_prior(2)
-    terms = prior.terms(torch.ones(2, 3, dtype=F64), torch.ones(2, 2, dtype=F64))
+    terms = prior.terms(torch.ones(2, 3, dtype=F64), torch.ones(2, 6, dtype=F64))
     values = {
         "pose": prior.pose,
         "drift": torch.zeros(len(prior.nodes.way), 6, dtype=F64),
