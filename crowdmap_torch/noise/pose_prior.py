@@ -10,6 +10,7 @@ module's own where it gives them; how far each journey is from them shows when m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -26,9 +27,10 @@ from crowdmap_torch.noise.bias_wander import (
     wandering_drives,
 )
 from crowdmap_torch.noise.drift_nodes import DriftNodes, begins_of
-from crowdmap_torch.noise.pooled_scales import pooled
+from crowdmap_torch.noise.pooled_scales import LEAST_SCALE, MOST_SCALE, pooled
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.noise.stated_sigmas import sigmas_of
+from crowdmap_torch.optim.fixed_point import fixed_point
 from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.ranges import Freedom, Length, Settings
@@ -37,8 +39,8 @@ from crowdmap_torch.tables import Journey
 
 CUT_TERMS = ("pose_before_cut", "pose_behind_cut")
 """The terms by which states at cuts are bound to the nodes around them."""
-_SWEEPS = 60
-"""Alternations between scales and what all journeys share."""
+_CYCLES = 5
+"""Extrapolations of the alternation between scales and what all journeys share."""
 WANDER_SCALE = 3
 """Column of the scales that is of the bias's wander, where there is any: behind bias, drift and rotation."""
 MOST_NUMBERS = 9
@@ -293,22 +295,31 @@ class PosePrior:
         count = torch.bincount(own, minlength=journeys).to(drift)[:, None]
         mean = self.nodes.mean(drift[:, :3], journeys)
         seen = count.clamp_max(1).expand(-1, 3)
-        bias, found = scale.square().T.split((1, len(chains)))
-        likely, wider = drift.new_ones(len(chains)), torch.ones_like(found)
-        likely_bias, wider_bias = drift.new_ones(1), torch.ones_like(bias)
         strengths = config.scale_strength, config.scale_trust
-        for _ in range(_SWEEPS):
-            variance = found[..., None] * given
-            found, likely, wider = pooled(likely, changes, pairs, variance, *strengths)
-            of_bias = bias[0, :, None] * given_bias
-            spread = of_bias + (found[..., None] * of_mean).sum(0)
+
+        def swept(likely: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Anew the fleet's scale of each kind, the journeys', both squared, and their means over medians."""
+            variance = found[1:, :, None] * given
+            of_chains = pooled(likely[1:], changes, pairs, variance, *strengths)
+            of_bias = found[0, :, None] * given_bias
+            spread = of_bias + (of_chains[0][..., None] * of_mean).sum(0)
             weight = seen / spread
             common = (weight * mean).sum(0) / weight.sum(0).clamp_min(1e-12)
-            squares = seen * bias[0, :, None] * (mean - common).square() / spread
-            bias, likely_bias, wider_bias = pooled(
-                likely_bias, squares[None], seen[None], spread[None], *strengths
-            )
-        return torch.cat((bias, found)).T.sqrt(), torch.cat((wider_bias, wider)).T
+            squares = seen * found[0, :, None] * (mean - common).square() / spread
+            bias = pooled(likely[:1], squares[None], seen[None], spread[None], *strengths)
+            both = (torch.cat(each) for each in zip(bias, of_chains, strict=True))
+            found, likely, wider = both
+            return likely, found, wider
+
+        def again(logs: Float[Tensor, "s k"]) -> Float[Tensor, "s k"]:
+            likely, found, _ = swept(logs[:, 0].exp(), logs[:, 1:].exp())
+            return torch.cat((likely[:, None], found), dim=1).log()
+
+        begun = torch.cat((scale.new_ones(1, scale.shape[1]), scale.square())).T.log()
+        bounds = (2 * math.log(bound) for bound in (LEAST_SCALE, MOST_SCALE))
+        ended = fixed_point(again, begun, _CYCLES, *bounds).exp()
+        _, found, wider = swept(ended[:, 0], ended[:, 1:])
+        return found.T.sqrt(), wider.T
 
     def _changes(
         self,
