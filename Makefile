@@ -19,11 +19,13 @@ help:  ## this list
 
 install: $(STAMP)  ## the package and its tools in .venv
 
-# torch comes first and by the constraint alone: nothing after it may choose another build.
+# torch comes first and by the constraint alone: nothing after it may choose another build. pip would compile on one core,
+# and packages' own tests too; what does not compile is said to be so by whoever imports it.
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -c constraints.txt torch
-	$(BIN)/python -m pip install -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --no-compile -c constraints.txt torch
+	$(BIN)/python -m pip install --no-compile -c constraints.txt -e '.[dev]'
+	-$(BIN)/python -m compileall -qq -j 0 -x '/tests/|/_internal/' $(VENV)/lib
 	touch $@
 
 demo: $(STAMP)  ## simulate a street, map it, compare the map with its survey; everything under demo/

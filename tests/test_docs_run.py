@@ -22,6 +22,7 @@ from examples import own_data
 from worlds.garage import write_garage
 from worlds.pages import PAGES, ROOT, Command, bare, said, words_of
 from worlds.programs import begin, checkout
+from worlds.runs import ROUGH
 
 import crowdmap_torch as cm
 from crowdmap_torch.cli import main
@@ -117,8 +118,8 @@ SMALLER: Mapping[str, str] = {
     # Four kilometres of streets would be laid out and mapped for the sake of two drives of 70 m.
     "crowdmap simulate DATA --world city": f"{SMALL} --square-m 500",
     "crowdmap simulate": SMALL,
-    # One process: others would import everything once more.
-    "crowdmap optimize": "--workers 1",
+    # One process: others would import everything once more. In few steps: whether it runs is asked, not how well it maps.
+    "crowdmap optimize": "--workers 1 --config FILE",
     "crowdmap benchmark adjustment": "--workers 1",
     "crowdmap benchmark association": "--workers 1 --methods joint",
     "crowdmap benchmark stages": "--workers 1",
@@ -191,17 +192,18 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     desk = tmp_path_factory.mktemp("desk")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(desk)
+        Path("FILE").write_text(ROUGH)
         assert (
             main(["simulate", "DATASET", "--world", "street", "--seed", "1", *SMALL.split()]) == 0
         )
-        assert main(["optimize", "DATASET", "--out", "RUN", "--workers", "1"]) == 0
+        rough = ("--workers", "1", "--config", "FILE")
+        assert main(["optimize", "DATASET", "--out", "RUN", *rough]) == 0
         for name in ("DATA", "D", "DRIVES", "suburb"):
             shutil.copytree("DATASET", name)
         shutil.copytree("RUN/map", "MAP")
         shutil.copytree("DATASET/survey", "SURVEY", ignore=shutil.ignore_patterns("truth"))
         ids = pq.read_table("SURVEY/signs.parquet").column("sign_id").to_pylist()
         Path("eligible.json").write_text(json.dumps({"journey-000": ids}))
-        Path("FILE").write_text("crowd: {rounds: 2}\n")
         own_data.main(Path("DATASET"), Path("FILES"))
         write_garage(desk / "GARAGE")
         # As the page says where the crossing is.
