@@ -30,6 +30,8 @@ _CLIP = 9.0
 """Squares of innovations are clipped at so many times what is expected of them."""
 _ROUNDS = 12
 """Rounds of reweighting."""
+_APART = 1e-9
+"""Share of the mean square of slopes that their variance is, at least, where they are not all alike but for rounding."""
 _TRUST = 24.0
 """Detections that tell of errors of poses alone that their being as large as they are taken to be counts as."""
 
@@ -108,13 +110,22 @@ def told_apart(
 def _least_squares(
     weight: Float[Tensor, " d"], slope: Float[Tensor, " d"], seen: Float[Tensor, " d"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, ""]]:
-    """`a` and `b`, neither below zero, of a + b `slope` as it was `seen`, and the information on `b`."""
+    """`a` and `b`, neither below zero, of a + b `slope` as it was `seen`, and the information on `b`.
+
+    Where slopes are alike there is none, and `b` is one.
+    """
     least = torch.finfo(seen.dtype).tiny
     one, both, two = (weight.sum(), (weight * slope).sum(), (weight * slope.square()).sum())
     of_one, of_two = (weight * seen).sum(), (weight * slope * seen).sum()
-    det = (one * two - both.square()).clamp_min(least)
+    det = one * two - both.square()
+    apart, det = det > _APART * one * two, det.clamp_min(least)
     a, b = (two * of_one - both * of_two) / det, (one * of_two - both * of_one) / det
     # At a bound the other one has all of it.
-    bounded_a = torch.where(b < 0, of_one / one.clamp_min(least), a).clamp_min(0)
+    bounded_a = torch.where(b < 0, of_one / one.clamp_min(least), a)
     bounded_b = torch.where(a < 0, of_two / two.clamp_min(least), b).clamp_min(0)
-    return bounded_a, bounded_b, (two - both.square() / one.clamp_min(least)).clamp_min(0)
+    told = two - both.square() / one.clamp_min(least)
+    return (
+        torch.where(apart, bounded_a, (of_one - both) / one.clamp_min(least)).clamp_min(0),
+        torch.where(apart, bounded_b, 1.0),
+        torch.where(apart, told, 0.0),
+    )

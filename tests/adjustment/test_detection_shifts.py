@@ -60,6 +60,23 @@ def test_what_is_not_counted_or_wild_does_not_matter():
         assert [float(x) for x in nothing] == [0.0, 1.0]
 
 
+@pytest.mark.parametrize("count", [1, 7, 495])
+@pytest.mark.parametrize("poses", [0.0, 1e-6, 0.3])
+def test_of_detections_that_are_moved_alike_all_beyond_errors_of_poses_is_shift(
+    count: int, poses: float
+):
+    """Nothing tells the two apart: a difference that is rounding is not divided by."""
+    g = torch.Generator().manual_seed(count)
+    square = 2 + torch.rand(count, generator=g, dtype=F64)
+    alike = torch.full((count,), poses, dtype=F64)
+    innovation = torch.stack((square, alike, torch.zeros_like(alike)), dim=1)
+    noise, every = torch.full((count,), 0.5, dtype=F64), torch.ones(count, dtype=torch.bool)
+    shift, share = told_apart(innovation, noise, every)
+    assert share == 1.0
+    expected = float(square.mean()) - 0.5 - poses if poses else 0.0
+    assert float(shift) == pytest.approx(expected, rel=1e-6)
+
+
 def test_an_adjustment_foresees_its_detections(adjusted: Adjusted):
     bundle = adjusted.bundle
     square, poses, others = bundle.innovation.unbind(1)
