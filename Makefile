@@ -20,12 +20,12 @@ help:  ## this list
 install: $(STAMP)  ## the package and its tools in .venv
 
 # torch comes first and by the constraint alone: nothing after it may choose another build. pip would compile on one core,
-# and packages' own tests too; what does not compile is said to be so by whoever imports it.
+# and packages' own tests too, of which torch has some for other Pythons.
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --no-compile -c constraints.txt torch
 	$(BIN)/python -m pip install --no-compile -c constraints.txt -e '.[dev]'
-	-$(BIN)/python -m compileall -qq -j 0 -x '/tests/|/_internal/' $(VENV)/lib
+	-$(BIN)/python -m compileall -qq -j 0 -x '/tests/|/testing/_internal/' $(VENV)/lib
 	touch $@
 
 demo: $(STAMP)  ## simulate a street, map it, compare the map with its survey; everything under demo/

@@ -115,17 +115,17 @@ def _least_squares(
     Where slopes are alike there is none, and `b` is one.
     """
     least = torch.finfo(seen.dtype).tiny
-    one, both, two = (weight.sum(), (weight * slope).sum(), (weight * slope.square()).sum())
+    one, two = weight.sum().clamp_min(least), (weight * slope.square()).sum().clamp_min(least)
+    both = (weight * slope).sum()
     of_one, of_two = (weight * seen).sum(), (weight * slope * seen).sum()
     det = one * two - both.square()
     apart, det = det > _APART * one * two, det.clamp_min(least)
     a, b = (two * of_one - both * of_two) / det, (one * of_two - both * of_one) / det
     # At a bound the other one has all of it.
-    bounded_a = torch.where(b < 0, of_one / one.clamp_min(least), a)
-    bounded_b = torch.where(a < 0, of_two / two.clamp_min(least), b).clamp_min(0)
-    told = two - both.square() / one.clamp_min(least)
+    bounded_a = torch.where(b < 0, of_one / one, a)
+    bounded_b = torch.where(a < 0, of_two / two, b).clamp_min(0)
     return (
-        torch.where(apart, bounded_a, (of_one - both) / one.clamp_min(least)).clamp_min(0),
+        torch.where(apart, bounded_a, (of_one - both) / one).clamp_min(0),
         torch.where(apart, bounded_b, 1.0),
-        torch.where(apart, told, 0.0),
+        torch.where(apart, two - both.square() / one, 0.0),
     )

@@ -297,29 +297,25 @@ class PosePrior:
         seen = count.clamp_max(1).expand(-1, 3)
         strengths = config.scale_strength, config.scale_trust
 
-        def swept(likely: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            """Anew the fleet's scale of each kind, the journeys', both squared, and their means over medians."""
+        def swept(logs: Float[Tensor, "s k"]) -> tuple[Float[Tensor, "s k"], Float[Tensor, "s j"]]:
+            """The fleet's scale of each kind and the journeys', log squares, anew; and their means over medians."""
+            likely, found = logs[:, 0].exp(), logs[:, 1:].exp()
             variance = found[1:, :, None] * given
             of_chains = pooled(likely[1:], changes, pairs, variance, *strengths)
-            of_bias = found[0, :, None] * given_bias
-            spread = of_bias + (of_chains[0][..., None] * of_mean).sum(0)
+            spread = found[0, :, None] * given_bias + (of_chains[0][..., None] * of_mean).sum(0)
             weight = seen / spread
             common = (weight * mean).sum(0) / weight.sum(0).clamp_min(1e-12)
             squares = seen * found[0, :, None] * (mean - common).square() / spread
-            bias = pooled(likely[:1], squares[None], seen[None], spread[None], *strengths)
-            both = (torch.cat(each) for each in zip(bias, of_chains, strict=True))
-            found, likely, wider = both
-            return likely, found, wider
-
-        def again(logs: Float[Tensor, "s k"]) -> Float[Tensor, "s k"]:
-            likely, found, _ = swept(logs[:, 0].exp(), logs[:, 1:].exp())
-            return torch.cat((likely[:, None], found), dim=1).log()
+            of_bias = pooled(likely[:1], squares[None], seen[None], spread[None], *strengths)
+            found, likely, wider = (
+                torch.cat(each) for each in zip(of_bias, of_chains, strict=True)
+            )
+            return torch.cat((likely[:, None], found), dim=1).log(), wider
 
         begun = torch.cat((scale.new_ones(1, scale.shape[1]), scale.square())).T.log()
         bounds = (2 * math.log(bound) for bound in (LEAST_SCALE, MOST_SCALE))
-        ended = fixed_point(again, begun, _CYCLES, *bounds).exp()
-        _, found, wider = swept(ended[:, 0], ended[:, 1:])
-        return found.T.sqrt(), wider.T
+        logs, wider = swept(fixed_point(lambda logs: swept(logs)[0], begun, _CYCLES, *bounds))
+        return (logs[:, 1:] / 2).exp().T, wider.T
 
     def _changes(
         self,
