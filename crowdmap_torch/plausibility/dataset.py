@@ -24,7 +24,7 @@ from crowdmap_torch.plausibility.consistency import (
 )
 from crowdmap_torch.plausibility.detections import Outlines, detection_findings
 from crowdmap_torch.plausibility.finding import Finding, Repair, gathered
-from crowdmap_torch.plausibility.lens import MissingLens, is_bare, lens_findings, own_missing_lens
+from crowdmap_torch.plausibility.lens import is_bare, lens_findings, own_missing_lens
 from crowdmap_torch.plausibility.lever import (
     HIDDEN_LEVER,
     Said,
@@ -33,6 +33,7 @@ from crowdmap_torch.plausibility.lever import (
     lever_of,
     said_of_lever,
 )
+from crowdmap_torch.plausibility.missing_lens import MissingLens
 from crowdmap_torch.plausibility.poses import ONE_HEIGHT, axes_alike, in_kilometres, pose_findings
 from crowdmap_torch.plausibility.put_right import FRAMES_LEFT_OUT, LEAPS_TAKEN_OUT
 from crowdmap_torch.plausibility.rig import rig_findings

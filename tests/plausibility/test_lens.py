@@ -15,15 +15,15 @@ from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.optim.band_cholesky import BandFactor, BandInverse
 from crowdmap_torch.plausibility.finding import Finding
 from crowdmap_torch.plausibility.lens import (
-    LensLimits,
-    MissingLens,
     _undistorted,
     _without_lens,
     lens_findings,
-    missing_lens,
     own_missing_lens,
 )
+from crowdmap_torch.plausibility.missing_lens import LensLimits, MissingLens, missing_lens
+from crowdmap_torch.simulate.dataset import write_dataset
 from crowdmap_torch.soak.spoiled import relensed, spoiled
+from crowdmap_torch.soak.varied import winding_street
 from crowdmap_torch.tables import Journey, Tracklets
 from crowdmap_torch.tracking.signs import associate_signs
 
@@ -94,6 +94,28 @@ def test_noise_of_pixels_does_not_make_a_lens_stronger(good: Path) -> None:
         noisy = px + 1.5 * torch.randn(px.shape, generator=generator, dtype=px.dtype)
         result = missing(replace(journey, signs=replace(journey.signs, corners_px=noisy)), tracks)
         assert abs(result.share) < max(0.25, 4 * result.sigma)
+
+
+def test_noise_of_poses_is_no_lens(tmp_path: Path) -> None:
+    street = winding_street(journeys=3)
+    noisy = replace(
+        street,
+        rig=replace(street.rig, camera="pinhole"),
+        positioning=replace(street.positioning, white_rot_deg=0.2),
+        signs=replace(street.signs, range_m=(12.0, 30.0)),
+    )
+    write_dataset(noisy, tmp_path / "noisy")
+    journeys = load_dataset(tmp_path / "noisy").journeys
+
+    drives = zip(journeys, tracked(journeys), strict=True)
+    own = [own_missing_lens(*drive, CONFIG.positioning) for drive in drives]
+    expected = [replace(one, as_detected=None) for one in own if one is not None]
+    limits = LensLimits(sure=2.0)
+    # By where signs are expected alone it is a barrel, of k1 = -0.04 to -0.13 as the seed falls.
+    assert [finding.kind for _, finding in lens_findings(journeys, expected, limits)] == 3 * [
+        "no-lens"
+    ]
+    assert lens_findings(journeys, own, limits) == []
 
 
 def test_which_sign_is_numbered_first_costs_nothing(
