@@ -51,21 +51,23 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     corners = problem.terms.get("sign_reprojection")
     # As large as what the lenses are taken anew in.
     del problem
-    if not bool(state.accepted.all()):
-        return state, state.done
+    if not bool(state.accepted.all()) and not state.done:
+        return state, False
     evidence = bundle.evidence() or bundle.told_by(normal, corners)
     del corners
     of_border = normal.border_information() if bundle.fleet.kinds else None
     bundle.fold(dict(state.values))
     found, first = bundle.refresh(evidence, of_border), int(bundle.judged) == 0
-    at_rest = found.scales
-    if (found.judging if first else at_rest and state.done) and bundle.judge(normal):
+    # Scales that no longer move anything are at rest, however much they still change: little is known of them.
+    settled = state.done and bool((state.in_sigmas_left < bundle.config.lm.move_tolerance).all())
+    at_rest = found.scales or settled
+    if (found.judging or settled if first else at_rest and state.done) and bundle.judge(normal):
         if state.done:
             state = lm.settled(bundle.problem(), state, normal, bundle.config.lm)
         at_rest &= state.done
         if at_rest:
             bundle.fold(dict(state.values))
-            at_rest = bundle.refresh(evidence).scales
+            at_rest = bundle.refresh(evidence).scales or settled
     if state.done and at_rest:
         return state, True
     return lm.changed(state), False

@@ -29,6 +29,8 @@ from crowdmap_torch.ranges import Damping, Factor, RoundsOrNone, Settings, Share
 RUNNING, CONVERGED_COST, CONVERGED_STEP, STALLED, NOT_FINITE, CONVERGED_MOVE = range(6)
 _UNDAMPED = 1e-6
 """Steps that are damped by more are short by themselves: they say nothing of how far the minimum is."""
+_FELT = 1e-4
+"""Less damping than this hardly shortens a step: one that was rejected is damped by as much at least."""
 _NEAR_BEST = 0.2
 """Steps that should be longer or shorter by less than this share stay as they are."""
 _FAR = 0.02
@@ -55,8 +57,9 @@ class LmConfig(Settings):
     step_tolerance: Share = 1e-10
     """Stop when the step's norm, in tangent units, is below this."""
     move_tolerance: Share = 0.0
-    """Stop when an accepted step moves the unknowns that are solved for last (a map's landmarks) by less than this share of
-    their own standard deviations, as root mean square: the rest is lost in how little is known of them. 0: never."""
+    """Stop when a step moves the unknowns that are solved for last (a map's landmarks) by less than this share of their own
+    standard deviations, as root mean square: the rest is lost in how little is known of them. One that is not accepted
+    would, and promised no more than `cost_tolerance`. 0: never."""
     initial_damping: Damping = 1e-4
     """First damping, relative to the Hessian's diagonal."""
     max_damping: Damping = 1e12
@@ -87,6 +90,10 @@ class LmState:
     gain_ratio: Float[Tensor, " groups"]
     """Decrease of the cost over the decrease that the model predicted, of the last step."""
     step_norm: Float[Tensor, " groups"]
+    in_sigmas: Float[Tensor, " groups"]
+    """By how many of their own standard deviations the last step that was taken moved what is solved for last."""
+    in_sigmas_before: Float[Tensor, " groups"]
+    """The same of the one before it; infinite until there was one."""
     stretch: Float[Tensor, " groups"]
     """What multiple of the step that was proposed last counts."""
     accepted: Bool[Tensor, " groups"]
@@ -104,6 +111,16 @@ class LmState:
     def done(self) -> bool:
         """True when no problem is running any more."""
         return bool((self.reason != RUNNING).all())
+
+    @property
+    def in_sigmas_left(self) -> Float[Tensor, " groups"]:
+        """How far all steps to come will go, if each is so much shorter than the one before as the last one was.
+
+        Infinite where that is not known: damping makes steps short, too.
+        """
+        ratio = self.in_sigmas / self.in_sigmas_before
+        left = self.in_sigmas * ratio / (1 - ratio)
+        return torch.where((ratio < 1) & (self.damping <= _UNDAMPED), left, torch.inf)
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -127,6 +144,8 @@ def init(
         term_cost=costs.by_term,
         gain_ratio=nothing,
         step_norm=nothing,
+        in_sigmas=torch.full_like(nothing, torch.inf),
+        in_sigmas_before=torch.full_like(nothing, torch.inf),
         stretch=torch.ones_like(cost),
         accepted=torch.zeros_like(cost, dtype=torch.bool),
         reason=torch.where(cost.isfinite(), RUNNING, NOT_FINITE),
@@ -156,7 +175,8 @@ def step(
     accepted = running & proposal.solved & trial[2].isfinite() & (decrease > 0)
 
     shrink = (1 - (2 * gain - 1) ** 3).clamp(1 / 3, 2.0)
-    damping = torch.where(accepted, state.damping * shrink, state.damping * state.growth)
+    raised = (state.damping * state.growth).clamp_min(_FELT)
+    damping = torch.where(accepted, state.damping * shrink, raised)
     damping = torch.where(running, damping, state.damping).clamp_min(config.min_damping)
     growth = torch.where(accepted, torch.full_like(gain, 2.0), state.growth * 2)
     tried = replace(state, accepted=accepted, damping=damping, stretch=length)
@@ -198,6 +218,8 @@ def step(
         },
         gain_ratio=torch.where(running, gain, state.gain_ratio),
         step_norm=torch.where(running, proposal.norm, state.step_norm),
+        in_sigmas=torch.where(accepted, proposal.in_sigmas * length, state.in_sigmas),
+        in_sigmas_before=torch.where(accepted, state.in_sigmas, state.in_sigmas_before),
         stretch=length,
         accepted=accepted,
         reason=reason,
@@ -225,7 +247,9 @@ def _reason(
     # Where the model itself promises next to nothing, a rejection is rounding and not a bad step.
     nothing_left = proposal.solved & ~accepted & (proposal.predicted <= 1e-3 * tolerance)
     reason[running & ((accepted & (decrease <= tolerance)) | nothing_left)] = CONVERGED_COST
-    lost = accepted & (proposal.in_sigmas * after.stretch < config.move_tolerance)
+    # So is one that would go no further, and is not worth a shorter one.
+    lost = accepted | (proposal.solved & (proposal.predicted <= tolerance))
+    lost &= proposal.in_sigmas * after.stretch < config.move_tolerance
     lost &= before.damping <= _UNDAMPED
     reason[running & lost & (reason == RUNNING)] = CONVERGED_MOVE
     tiny = proposal.solved & (proposal.norm < config.step_tolerance)

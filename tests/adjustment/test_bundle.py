@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
@@ -86,6 +86,26 @@ def test_what_is_known_of_poses_is_found_anew_when_scales_or_judgements_have_cha
         change()
         assert bundle.evidence() is None
         bundle.told_at.copy_(bundle.scales())
+
+
+def test_scales_that_move_no_landmark_keep_no_adjustment_going(
+    build: Callable[[], Bundle], monkeypatch: pytest.MonkeyPatch
+):
+    bundle, refresh = build(), Bundle.refresh
+
+    def restless(self: Bundle, *args: Any) -> AtRest:
+        refresh(self, *args)
+        return AtRest(False, False)
+
+    monkeypatch.setattr(Bundle, "refresh", restless)
+    state = adjust.adjust(bundle)
+    lm_config = bundle.config.lm
+    assert state.iterations < lm_config.max_iterations and int(bundle.judged) >= 1
+    assert float(state.in_sigmas_left) < lm_config.move_tolerance
+    # By scales that go on moving landmarks nothing is judged.
+    bundle, moves = build(), replace(lm_config, max_iterations=state.iterations, move_tolerance=0.0)
+    bundle.config = replace(bundle.config, lm=moves)
+    assert adjust.adjust(bundle).iterations == state.iterations and int(bundle.judged) == 0
 
 
 def test_the_papers_cost_weighs_every_corner_and_lane_point_by_itself_and_all_pixels_alike(

@@ -12,7 +12,7 @@ from crowdmap_torch.optim.linearize import autograd_jacobians, linearize, rows, 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean, positive
 from crowdmap_torch.optim.robust import Huber, Quadratic, Tukey, median_scale
 from crowdmap_torch.optim.solvers.dense import DenseBackend
-from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
+from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions, Step
 
 ROWS = 40
 
@@ -106,6 +106,18 @@ def test_a_step_that_is_lost_in_how_little_is_known_is_the_last():
     assert float(left.square().mean().sqrt()) < 0.1
 
 
+def test_what_is_left_of_steps_that_shrink_alike_is_their_sum():
+    problem, true = curves(3)
+    state = lm.init(problem, {"x": true}, lm.LmConfig(initial_damping=1e-9))
+    assert state.in_sigmas_left.isinf().all()
+    before, last = torch.tensor([[0.4, 0.2, 0.1], [0.1, 0.1, 0.1]], dtype=torch.float64)
+    state = replace(state, in_sigmas_before=before, in_sigmas=last)
+    # 1/40 + 1/160 + ...; 1/20 + 1/40 + ...; no end.
+    expected = torch.tensor([1 / 30, 0.1, torch.inf], dtype=torch.float64)
+    torch.testing.assert_close(state.in_sigmas_left, expected)
+    assert replace(state, damping=torch.ones_like(last)).in_sigmas_left.isinf().all()
+
+
 def test_a_step_that_damping_made_short_is_not_the_last():
     problem, true = curves(20)
     config = lm.LmConfig(cost_tolerance=0.0, move_tolerance=0.1, initial_damping=1e6)
@@ -127,6 +139,28 @@ def test_a_rejected_step_keeps_the_linearisation():
         state = after
     assert rejected
     assert state.linearizations == state.iterations - rejected + (0 if state.accepted else 1)
+
+
+@pytest.mark.parametrize(("promise", "sigmas"), [(1e-6, 0.05), (1e-3, 0.05), (1e-6, 0.2)])
+def test_a_step_that_is_not_worth_a_shorter_one_is_the_last(
+    promise: float, sigmas: float, monkeypatch: pytest.MonkeyPatch
+):
+    problem, true = curves(1)
+    exact = lm.solve(problem, {"x": true}, lm.LmConfig(cost_tolerance=1e-14))
+    config = lm.LmConfig(cost_tolerance=1e-5, move_tolerance=0.1, initial_damping=1e-9)
+    start = lm.init(problem, exact.values, config, backend=DenseBackend())
+
+    def away(_: object, damping: torch.Tensor) -> Step:
+        one = torch.ones_like(damping)
+        return Step({"x": one[:, None] * 1e-3}, promise * start.cost, one > 0, one, sigmas * one)
+
+    monkeypatch.setattr(type(start.normal), "solve", away)
+    after = lm.step(problem, start, config)
+    assert not bool(after.accepted) and after.values is start.values
+    # What no longer counts is left; anything else is tried again, damped by as much as is felt.
+    is_last = promise < config.cost_tolerance and sigmas < config.move_tolerance
+    assert after.done == is_last
+    assert float(after.damping) == 1e-4
 
 
 def test_a_start_that_is_not_finite_is_a_reason():
