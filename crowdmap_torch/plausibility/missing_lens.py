@@ -228,12 +228,14 @@ def lens_view(
     a, b, c = path[3:6, None]
     depth = (z - a * y + b * x).clamp_min(MIN_DEPTH)
     seen = torch.stack(((x - b * z + c * y) / depth, (y - c * x + a * z) / depth), dim=-1)
-    missing, place = path[6][..., None], seen
-    if detected is not None:
+    missing, raw = path[6][..., None], distort(given, seen)
+    if detected is None:
+        bent = distort(other, seen) - raw
+    else:
         near, far = detected[0].movedim(0, -1), detected[1].movedim(0, -1)
         place = seen + (near + missing * (far - near) - _middle(seen))
-    bent = distort(other, place) - distort(given, place)
-    predicted = distort(given, seen) + missing * bent
+        bent = distort(other, place) - distort(given, place)
+    predicted = raw + missing * bent
     return (whitening * (predicted.movedim(-1, 1) - px).flatten(0, 1)).sum(1)
 
 
