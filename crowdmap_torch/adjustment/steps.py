@@ -59,7 +59,9 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     bundle.fold(dict(state.values))
     found, first = bundle.refresh(evidence, of_border), int(bundle.judged) == 0
     # Scales that no longer move anything are at rest, however much they still change: little is known of them.
-    settled = state.done and bool((state.in_sigmas_left < bundle.config.lm.move_tolerance).all())
+    # One short step does not tell: it may be the last before other detections count.
+    moves = torch.maximum(state.in_sigmas_before, state.in_sigmas_left)
+    settled = state.done and bool((moves < bundle.config.lm.move_tolerance).all())
     at_rest = found.scales or settled
     if (found.judging or settled if first else at_rest and state.done) and bundle.judge(normal):
         if state.done:
