@@ -58,8 +58,8 @@ class LmConfig(Settings):
     """Stop when the step's norm, in tangent units, is below this."""
     move_tolerance: Share = 0.0
     """Stop when a step moves the unknowns that are solved for last (a map's landmarks) by less than this share of their own
-    standard deviations, as root mean square: the rest is lost in how little is known of them. One that is not accepted
-    would, and promised no more than `cost_tolerance`. 0: never."""
+    standard deviations, as root mean square: the rest is lost in how little is known of them. So is a step that is not
+    accepted, if it is as short and promises no more than `cost_tolerance`. 0: never."""
     initial_damping: Damping = 1e-4
     """First damping, relative to the Hessian's diagonal."""
     max_damping: Damping = 1e12

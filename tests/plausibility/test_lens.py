@@ -111,7 +111,7 @@ def test_noise_of_poses_is_no_lens(tmp_path: Path) -> None:
     own = [own_missing_lens(*drive, CONFIG.positioning) for drive in drives]
     expected = [replace(one, as_detected=None) for one in own if one is not None]
     limits = LensLimits(sure=2.0)
-    # By where signs are expected alone it is a barrel, of k1 = -0.04 to -0.13 as the seed falls.
+    # By where signs are expected alone it is a barrel.
     assert [finding.kind for _, finding in lens_findings(journeys, expected, limits)] == 3 * [
         "no-lens"
     ]
