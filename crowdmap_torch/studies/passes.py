@@ -49,11 +49,15 @@ class MeasureDrives(Task):
     recorded: Path | None = None
     """Segment of comma2k19 with a receiver's fixes."""
     config: MapperConfig = field(default_factory=MapperConfig)
+    seen_from: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the camera of the images is, in the axes of the one that poses and survey are of [m]."""
 
     @property
     def key(self) -> str:
         """Of the name of the drive and the settings."""
-        settings = {"config": config_hash(self.config), "gate_m": self.gate_m}
+        settings: dict[str, object] = {"config": config_hash(self.config), "gate_m": self.gate_m}
+        if any(self.seen_from):
+            settings["seen_from"] = self.seen_from
         crowd = f"{self.crowd}-{self.errors}"
         return f"drives-{self.dataset.name}-{crowd}-{digest(settings)}"
 
@@ -102,9 +106,9 @@ class MeasureDrives(Task):
 
     def _driven(self, drive: Journey, number: int) -> Journey:
         """The drive with the errors of a positioning of its own; the reference's sigmas then hold no more."""
-        T = drive.T_world_camera
+        T = _beside(drive.T_world_camera, self.seen_from)
         if self.errors == "none":
-            return replace(drive, sigma_position=None, sigma_rotation=None)
+            return replace(drive, T_world_camera=T, sigma_position=None, sigma_rotation=None)
         if self.errors == "simulated":
             way = station(T).numpy()
             drawn = pose_errors(way, PositioningConfig(), np.random.default_rng(number))
@@ -150,9 +154,9 @@ class MeasureDrives(Task):
         drive: Journey,
         surveyed: dict[str, SurveyedFrom],
     ) -> dict[str, float]:
-        return local_errors(
-            center_world, T_world_camera, drive.frame_number, surveyed, gate_m=self.gate_m
-        )
+        back = [-one for one in self.seen_from]
+        poses = _beside(T_world_camera, back)
+        return local_errors(center_world, poses, drive.frame_number, surveyed, gate_m=self.gate_m)
 
     def _relative(
         self, survey: Survey, final: HdMap, journey_maps: Sequence[JourneyMap]
@@ -182,6 +186,15 @@ def _signs_of(drive: Journey, surveyed: dict[str, SurveyedFrom]) -> int:
     return sum(
         bool(torch.isin(seen.frame_number, drive.frame_number).any()) for seen in surveyed.values()
     )
+
+
+def _beside(
+    T_world_camera: Float[Tensor, "f 4 4"], place: Sequence[float]
+) -> Float[Tensor, "f 4 4"]:
+    """Poses of a camera at a place in the axes of the given one [m], turned as it is."""
+    T_camera_other = torch.eye(4).to(T_world_camera)
+    T_camera_other[:3, 3] = torch.tensor(place)
+    return T_world_camera @ T_camera_other
 
 
 def _means(by_drive: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -90,6 +90,26 @@ def test_copies_are_as_many_drives_each_with_errors_of_its_own(
     assert all(torch.equal(one.signs.corners_px, drive.signs.corners_px) for one in made)
 
 
+def test_signs_are_surveyed_from_another_camera_than_the_one_that_saw_them(
+    tiny_folder: Path, surveyed_from: Path
+):
+    drive = load_dataset(tiny_folder).journeys[0]
+    surveyed = read_surveyed_from(surveyed_from)[tiny_folder.name]
+    task = MeasureDrives(tiny_folder, surveyed_from, 2.0, "alone")
+    beside = replace(task, seen_from=(-0.3, 0.0, 0.1))
+    moved = beside._driven(drive, 0)
+    place = torch.tensor((-0.3, 0.0, 0.1)).to(drive.T_world_camera)
+    seen = se3.transform(drive.T_world_camera, place.expand(drive.frame_count, 3))
+    assert torch.allclose(moved.T_world_camera[:, :3, 3], seen, atol=1e-9)
+    assert torch.equal(moved.T_world_camera[:, :3, :3], drive.T_world_camera[:, :3, :3])
+    signs = read_survey(tiny_folder / "survey").signs.center_world + 0.1
+    near = task._local(signs, drive.T_world_camera, drive, surveyed)
+    assert near and beside._local(signs, moved.T_world_camera, moved, surveyed) == pytest.approx(
+        near
+    )
+    assert beside.key != task.key
+
+
 def test_errors_of_different_kinds_are_different_work(tiny_folder: Path, surveyed_from: Path):
     kinds = [
         MeasureDrives(tiny_folder, surveyed_from, 2.0, crowd, errors)

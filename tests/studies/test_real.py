@@ -57,10 +57,11 @@ def test_passes_are_measured_alone_and_as_crowds(drives: Settings, folder: Study
     assert drives.real is not None
     (drives.real / "surveyed_from.json").write_text("{}")
     crowds = [task for task in work(real, drives) if isinstance(task, MeasureDrives)]
-    # Each sequence: by itself with calibration and without, both crowds with two kinds of errors.
-    assert len(crowds) == 2 * (2 + 2 * 2)
+    # Each sequence: by itself with calibration, without, and from where its boxes were drawn; both crowds with two kinds
+    # of errors.
+    assert len(crowds) == 2 * (3 + 2 * 2) == len({task.key for task in crowds})
     recorded = work(real, replace(drives, recorded=Path("segment")))
-    assert sum(isinstance(task, MeasureDrives) for task in recorded) == 2 * (2 + 2 * 3)
+    assert sum(isinstance(task, MeasureDrives) for task in recorded) == 2 * (3 + 2 * 3)
     for task in crowds:
         far = 0.4 if task.dataset.name == "kitti-00" else 0.2
         errors = {"single": {"a@0": far, "b@0": 9.0}, "map": {"a@0": far / 2, "c@0": 9.0}}
