@@ -61,7 +61,7 @@ class BundleState(nn.Module):
     calibration_far: Tensor
     """By car and number, how far it is beyond these sigmas as they are."""
     drift_told: Tensor
-    """By journey and number of a pose, the share of the drift's changes that observations tell."""
+    """By journey and number of a pose, the share of the drift's changes that observations tell; zero before."""
     poses_left: Tensor
     """Variance that is left of every pose's deviation from its drift."""
     held_off: Tensor
@@ -115,7 +115,7 @@ class BundleState(nn.Module):
         numbers = sum(self.variables[name].tangent_dim for name in self.fleet.variables)
         far = self.scale.new_ones(len(self.fleet.vehicles), numbers)
         self.register_buffer("calibration_far", far)
-        self.register_buffer("drift_told", values["bias"].new_ones(len(values["bias"]), wide))
+        self.register_buffer("drift_told", values["bias"].new_zeros(len(values["bias"]), wide))
         self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
         self.register_buffer("held_off", values["pose"].new_zeros(0))
         self.register_buffer("innovation", values["pose"].new_zeros(0, 3))

@@ -17,9 +17,11 @@ from crowdmap_torch.adjustment.bundle import Bundle
 
 _SCALES = (
     *("scale", "small_box", "lasting", "share_there"),
-    *("prior_scale", "white_scale", "calibration_scale", "calibration_far"),
+    *("prior_scale", "drift_told", "white_scale", "calibration_scale", "calibration_far"),
 )
 """What a bundle keeps of noise: of pixels, of poses and of cars."""
+_BY_KIND = ("prior_scale", "drift_told")
+"""Of these what has a column for each kind of error that poses have."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
         values["cut"] = bundle.prior.at_cuts(values["drift"])
     for name, there in footing.scales.items():
         here = getattr(bundle, name)
-        if name == "prior_scale":
+        if name in _BY_KIND:
             here = here[:, : there.shape[1]]
             there = there[:, : here.shape[1]]
         here.copy_(there)

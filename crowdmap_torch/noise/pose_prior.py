@@ -250,7 +250,8 @@ class PosePrior:
 
         `drift` is the estimated one. What all journeys share is taken off, and costs its degrees of freedom (restricted
         maximum likelihood); a journey's scale is drawn towards the fleet's, and that towards one. Changes count as far as
-        observations have `told` them: an estimate follows the prior where nothing is seen, and says nothing of it.
+        observations have `told` them: an estimate follows the prior where nothing is seen, and says nothing of it. Where
+        none is told yet, a drift that moves makes sigmas larger, and none that stands makes them smaller.
         """
         return self._scales(drift, scale, told)[0]
 

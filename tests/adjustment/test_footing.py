@@ -59,6 +59,19 @@ def test_it_stands_where_the_other_one_ended(tiny, tiny_result: MapResult, ended
     assert int(again.judged) == 1 and torch.equal(again.given_up, ended.given_up)
 
 
+def test_scales_of_poses_are_not_found_anew_where_nothing_was_told_yet(
+    tiny, tiny_result: MapResult, ended: Bundle
+):
+    again = built(tiny, tiny_result, anew(tiny, tiny_result.first, ended))
+    new = built(tiny, tiny_result, replace(tiny_result.first, footing=None))
+    for bundle in (again, new):
+        adjust.start(bundle)
+    assert torch.allclose(again.prior_scale, ended.prior_scale, rtol=0.02)
+    assert (ended.prior_scale - 1).abs().max() > 0.1
+    # Poses as they are given drift by nothing: that is no drift that was seen.
+    assert bool((new.prior_scale[:, 1:] >= 1).all())
+
+
 def test_what_was_known_of_cars_and_noise_need_not_be_found_again(
     tiny, tiny_result: MapResult, ended: Bundle
 ):
