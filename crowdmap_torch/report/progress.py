@@ -16,7 +16,10 @@ _PLAIN_EVERY_S = 10.0
 
 
 class Progress:
-    """Says which stage runs, how far it is, and when it will be done; keeps each stage's seconds and memory."""
+    """Says which stage runs, how far it is, and when it will be done; keeps each stage's seconds and memory.
+
+    A stage that comes back, as where an adjustment begins again, adds to its seconds.
+    """
 
     def __init__(self, stream: TextIOBase | None = None) -> None:
         self.seconds: dict[str, float] = {}
@@ -25,6 +28,10 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._rewrites = self._stream.isatty()
         self._stage = ""
+        self._earlier = 0.0
+        """Seconds of the stage when it ran before."""
+        self._begun_at = 0
+        """Steps of it that were finished when it began."""
         self._started = time.monotonic()
         self._said = self._started
 
@@ -33,13 +40,14 @@ class Progress:
         now = time.monotonic()
         if stage != self._stage:
             self.finish()
-            self._stage, self._started = stage, now
+            self._stage, self._started, self._begun_at = stage, now, done
+            self._earlier = self.seconds.get(stage, 0.0)
             restart_peak()
         elapsed = now - self._started
-        self.seconds[stage] = elapsed
+        self.seconds[stage] = self._earlier + elapsed
         text = stage if not total else f"{stage} {done}/{total}"
-        if done and done < total:
-            text += f", {elapsed * (total - done) / done:.0f} s left"
+        if self._begun_at < done < total:
+            text += f", {elapsed * (total - done) / (done - self._begun_at):.0f} s left"
         if note:
             text += f", {note}"
         if self._rewrites:
@@ -53,7 +61,7 @@ class Progress:
         """End the stage that runs, and its line."""
         if not self._stage:
             return
-        self.seconds[self._stage] = time.monotonic() - self._started
+        self.seconds[self._stage] = self._earlier + time.monotonic() - self._started
         if (peak := peak_bytes()) is not None:
             self.peak_gb[self._stage] = max(self.peak_gb.get(self._stage, 0.0), peak / 1e9)
         if self._rewrites:

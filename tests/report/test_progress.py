@@ -33,6 +33,17 @@ def test_a_stage_has_the_seconds_between_its_name_and_the_next(clock):
     assert told.seconds == {"read": 2.0, "map": 3.0}
 
 
+def test_a_stage_that_comes_back_has_the_seconds_of_all_its_times(clock):
+    told = Progress(io.StringIO())
+    for seconds in (2.0, 5.0):
+        told("build")
+        clock[0] += seconds
+        told("adjust")
+        clock[0] += 1.0
+    told.finish()
+    assert told.seconds == {"build": 7.0, "adjust": 2.0}
+
+
 @pytest.mark.skipif(peak_bytes() is None, reason="memory is read in /proc")
 def test_a_stage_has_the_memory_that_it_held_and_not_what_one_before_it_did():
     told = Progress(io.StringIO())
@@ -73,3 +84,13 @@ def test_what_is_left_is_as_slow_as_what_was_done(clock):
     clock[0] = 10.0
     told("map", 1, 4)
     assert stream.getvalue().endswith("map 1/4, 30 s left")
+
+
+def test_what_was_done_when_a_stage_began_says_nothing_of_what_is_left(clock):
+    stream = Terminal()
+    told = Progress(stream)
+    told("map", 5, 30)
+    assert stream.getvalue().endswith("map 5/30")
+    clock[0] = 10.0
+    told("map", 6, 30)
+    assert stream.getvalue().endswith("map 6/30, 240 s left")
