@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from crowdmap_torch.clustering.neighbours import (
@@ -9,6 +10,7 @@ from crowdmap_torch.clustering.neighbours import (
     near_pairs,
     pairs_between,
     pairs_in_radius,
+    rows_near,
 )
 
 
@@ -30,6 +32,25 @@ def test_cross_pairs_are_those_within_the_radius():
     point = points()
     wanted = torch.nonzero(torch.cdist(point[:10], point[10:]) < 1.0)
     assert torch.equal(cross_pairs(point[:10], point[10:], radius=1.0, count=30), wanted)
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 3])
+@pytest.mark.parametrize("radius", [0.01, 0.7, 300.0])
+def test_many_points_lose_those_far_from_a_few_and_no_others(dimension: int, radius: float):
+    g = torch.Generator().manual_seed(dimension)
+    many = 200 * torch.rand(30_000, dimension, generator=g, dtype=torch.float64) - 100
+    beside = many[40:80].clone()
+    beside[:, 0] += 0.999 * radius
+    few = torch.cat((many[:40], beside, 5000 + many[:9]))
+    apart = torch.cdist(many, few, compute_mode="donot_use_mm_for_euclid_dist")
+    rows = torch.from_numpy(rows_near(many.numpy(), few.numpy(), radius))
+    near = (apart <= radius).any(1)
+    assert torch.isin(near.nonzero()[:, 0], rows).all() and (rows.diff() > 0).all()
+    assert int(near.sum()) >= 80 and (radius > 1 or dimension == 1 or len(rows) < len(many) / 2)
+    row, column, _ = pairs_between(many, few, radius=radius)
+    assert torch.equal(torch.stack((row, column), dim=1), (apart <= radius).nonzero())
+    column, row, _ = pairs_between(few, many, radius=radius)
+    assert torch.equal(torch.stack((column, row), dim=1), (apart.T <= radius).nonzero())
 
 
 def test_pairs_between_two_sets_are_those_within_the_radius_with_their_distance(
