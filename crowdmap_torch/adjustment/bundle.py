@@ -20,7 +20,7 @@ from crowdmap_torch.adjustment.noise_pull import held_off, left_by_prior, noise_
 from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.adjustment.parts import Observations, Priors, SharedOut, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
-from crowdmap_torch.adjustment.shared_corner_errors import lasting_variance, shared_errors
+from crowdmap_torch.adjustment.shared_corner_errors import Lasting, lasting_errors, shared_errors
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, pose_evidence, white_scales
 from crowdmap_torch.noise.pose_prior import CUT_TERMS, WANDER_SCALE
@@ -293,10 +293,11 @@ class Bundle(BundleState):
         corners, *lanes = narrows.tolist()
         if corners or not foreseen or self.config.method == "paper2017":
             return not corners, not any(lanes)
-        lasting, share, rests = self.together.of_all(
+        lasting, size, share, rests = self.together.of_all(
             self._seen_lasting, of_corners, self.innovation
         )
         self.lasting.copy_(lasting)
+        self.lasting_size.copy_(size)
         self.share_there.copy_(share)
         lasting_rests, share_rests = rests.tolist()
         return lasting_rests, share_rests and not any(lanes)
@@ -315,13 +316,13 @@ class Bundle(BundleState):
 
     def _seen_lasting(
         self, of_corners: Float[Tensor, "m 2"], innovation: Float[Tensor, "d 3"]
-    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Bool[Tensor, " 2"]]:
-        """What lasts of detections' shifts by the errors of all, what share of poses' is there, and whether each rests.
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, ""], Bool[Tensor, " 2"]]:
+        """What lasts of shifts and of sizes by the errors of all, what share of poses' is there, and whether both rest.
 
         From the second time on either goes half of the way to where it is found: it is found by what it was.
         """
         if not len(of_corners):
-            return self.lasting, self.share_there, self.given_up.new_ones(2)
+            return self.lasting, self.lasting_size, self.share_there, self.given_up.new_ones(2)
         rows, detections = self.whole.corners, self.whole.detections
         # Corners of boxes tell little of it, and would hide that of outlines; the centre of a box counts.
         used = detections.have(~self.given_up[rows.detection] & (rows.loose_px == 0))
@@ -329,15 +330,20 @@ class Bundle(BundleState):
         of_each, share = told_apart(innovation, noise, used)
         # Errors that are larger than they are taken to be are so until the scales have found them.
         share = share.clamp_max(1.0)
-        lasting = lasting_variance(detections, of_corners, used, of_each)
-        moved = (lasting - self.lasting).abs()
-        lasting_rests = moved <= _LASTING_RESTS * (lasting + noise.mean())
+        found = lasting_errors(detections, rows, of_corners, noise, used, of_each)
+        shift, before = found.shift, self.lasting
+        shift_rests = (shift - before).abs() <= _LASTING_RESTS * (shift + noise.mean())
+        # Told once, of a fit that has come to rest: where sizes count for less, their errors show what else is wrong.
+        is_told = (self.lasting_size > 0) | (self.judged == 0)
+        size = torch.where(is_told, self.lasting_size, found.size)
+        rest = shift_rests & (size == self.lasting_size)
         share_rests = (share - self.share_there).abs() <= _SHARE_RESTS
         far = torch.where(self.share_there == 1, 1.0, 0.5)
         return (
-            torch.where(lasting_rests, self.lasting, torch.lerp(self.lasting, lasting, far)),
+            torch.where(shift_rests, before, torch.lerp(before, shift, far)),
+            size,
             torch.lerp(self.share_there, share, far),
-            torch.stack((lasting_rests, share_rests)),
+            torch.stack((rest, share_rests)),
         )
 
     def problem(self) -> Problem:
@@ -410,8 +416,9 @@ class Bundle(BundleState):
             loss,
             reprojection.sign_reprojection_jacobian,
         )
-        if isinstance(sigma, Tensor) and bool(self.lasting > 0):
-            term = replace(term, shared=shared_errors(self.detections, sigma, self.lasting))
+        lasting = Lasting(self.lasting, self.lasting_size)
+        if isinstance(sigma, Tensor) and bool(lasting.shift + lasting.size > 0):
+            term = replace(term, shared=shared_errors(self.detections, rows.px, sigma, lasting))
         return {"sign_reprojection": self.fleet.of_corners(term, rows, self._by_optics[0])}
 
     def _loss_of_detections(self) -> JointTukey:

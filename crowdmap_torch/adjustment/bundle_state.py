@@ -48,6 +48,8 @@ class BundleState(nn.Module):
     """Box [px] at which a corner's standard deviation is 1.41 times that of a large box."""
     lasting: Tensor
     """Variance [px^2] of a detection's shift, in the mean of many successive ones, beyond its corners' noise."""
+    lasting_size: Tensor
+    """Likewise of the share by which a detection is too large."""
     judged: Tensor
     """How often detections were judged by everything else."""
     given_up: Tensor
@@ -102,6 +104,7 @@ class BundleState(nn.Module):
         self.register_buffer("scale", values["pose"].new_full((3,), torch.inf))
         self.register_buffer("small_box", torch.zeros_like(self.scale[0]))
         self.register_buffer("lasting", torch.zeros_like(self.scale[0]))
+        self.register_buffer("lasting_size", torch.zeros_like(self.scale[0]))
         last = int(corners.detection.max()) + 1 if len(corners) else 0
         last = last if shared_out is None else shared_out.detections
         given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
@@ -238,7 +241,8 @@ class BundleState(nn.Module):
     def scales(self) -> Float[Tensor, " s"]:
         """All scales that weigh observations and the prior, and how often detections were judged."""
         corner = (self.scale[0].square() + self.lasting).sqrt()
-        of_pixels = (self.scale[1:], corner[None], 1.0 + self.judged[None])
+        size = 0.01 + self.lasting_size.sqrt()
+        of_pixels = (self.scale[1:], corner[None], size[None], 1.0 + self.judged[None])
         return torch.cat((self.prior_scale.flatten(), self.white_scale.flatten(), *of_pixels))
 
 

@@ -1,9 +1,9 @@
 """What the corners of a detection have wrong together, for a while: a detector's box that trembles.
 
-All corners of a detection are off to one side, and still are in the next frame: views of a sign in one drive are worth
-fewer than there are. How much fewer shows in the misfits of successive detections of a sign, which noise of single corners
-and of single poses does not join. In the solver detections err independently; what lasts is counted as so much variance
-more as the mean of many successive ones has: its spectral density at low frequencies.
+All corners of a detection are off to one side, or all away from their middle, and still are in the next frame: views of a
+sign in one drive are worth fewer than there are. How much fewer shows in the misfits of successive detections of a sign,
+which noise of single corners and of single poses does not join. In the solver detections err independently; what lasts is
+counted as so much variance more as the mean of many successive ones has: its spectral density at low frequencies.
 """
 
 from __future__ import annotations
@@ -19,8 +19,11 @@ from crowdmap_torch.clustering.groups import group_sum
 from crowdmap_torch.optim.robust import median_scale
 from crowdmap_torch.optim.shared_errors import SharedErrors
 
-_MOST_LAGS = 30
-"""Detections of a track that are this far apart are taken to err independently."""
+_SHIFT_LAGS, _SIZE_LAGS = 30, 90
+"""Detections of a track that are this far apart are taken to be shifted, and too large, independently: what lasts longer of
+a shift poses take up."""
+_LEAST = 1e-30
+"""Far below any weight or square of pixels."""
 _CLIP = 3.0
 """Standard deviations at which misfits are clipped before they are compared."""
 
@@ -87,38 +90,126 @@ def corner_detections(rows: CornerObservations) -> CornerDetections:
     return CornerDetections(run, rank, most, count.to(rows.px), first, follower)
 
 
+@dataclass(frozen=True)
+class Lasting:
+    """Variances of the means of many successive errors of detections, times their number."""
+
+    shift: Float[Tensor, ""]
+    """To one side, in u and in v each [px^2]."""
+    size: Float[Tensor, ""]
+    """Of their size, as shares of it."""
+
+
 def shared_errors(
-    detections: CornerDetections, sigma: Float[Tensor, " m"], lasting: Float[Tensor, ""]
+    detections: CornerDetections,
+    px: Float[Tensor, "m 2"],
+    sigma: Float[Tensor, " m"],
+    lasting: Lasting,
 ) -> SharedErrors:
-    """How corners with a noise of `sigma` [px] each weigh together where shifts of `lasting` variance [px^2] last."""
-    of, count = detections.run, detections.count
-    pattern = count.rsqrt()[of].expand(2, 1, -1).movedim(-1, 0)
-    keep = (1 + count[of] * lasting / sigma.square()).rsqrt().expand(2, 1, -1).movedim(-1, 0)
+    """How corners at `px` with a noise of `sigma` [px] each weigh together where some of what they err by lasts."""
+    of, count = detections.run, detections.count[:, None].expand(-1, 2)
+    about, spread = _about_middle(detections, px)
+    pattern = torch.stack((count.rsqrt()[of], about * spread.clamp_min(_LEAST).rsqrt()[of]), dim=-1)
+    # Size counts in u and in v by itself, as if each erred on its own: together they then tell of it what one would.
+    variance = torch.stack((count * lasting.shift, 2 * spread * lasting.size), dim=-1)
+    keep = (1 + variance[of] / sigma.square()[:, None, None]).rsqrt()
     return SharedErrors(of, detections.rank, detections.most, pattern, keep)
 
 
-def lasting_variance(
+def lasting_errors(
     detections: CornerDetections,
+    rows: CornerObservations,
     residual: Float[Tensor, "m 2"],
+    noise: Float[Tensor, " d"],
     used: Bool[Tensor, " d"],
-    of_each: Float[Tensor, ""],
-) -> Float[Tensor, ""]:
-    """Variance of the mean of many successive shifts, times their number [px^2], with that `of_each` alone.
+    shift_of_each: Float[Tensor, ""],
+) -> Lasting:
+    """What lasts by the errors [px] of corners; detections that are not `used` are left out.
 
-    Of pixel errors; detections that are not `used` are left out. The sum of the covariances of detections ever further
-    apart in their tracks, as long as they are positive (Geyer, Practical Markov Chain Monte Carlo, 1992).
+    `noise` is what corners' own makes of the mean of a detection, `shift_of_each` the variance of a single shift, both
+    [px^2]: poses hide that.
     """
-    shift = detections.mean(residual)
-    if not bool(used.any()):
-        return torch.zeros_like(of_each)
-    bound = _CLIP * torch.stack([median_scale(x) for x in shift[used].unbind(1)])
-    shift = torch.where(used[:, None], torch.minimum(torch.maximum(shift, -bound), bound), 0.0)
-    total, goes_on = of_each, torch.ones_like(of_each)
-    later = detections.follower
-    for _ in range(_MOST_LAGS):
-        pairs = (later >= 0) & used & used[later]
-        together = (shift * shift[later] * pairs[:, None]).sum() / (2 * pairs.sum()).clamp_min(1)
-        goes_on = goes_on * (together > 0)
-        total = total + 2 * goes_on * together
-        later = torch.where(later >= 0, detections.follower[later], -1)
-    return total.clamp_min(0)
+    size = _size_errors(detections, rows, residual, detections.count * noise, used)
+    shift = _Errors(detections.mean(residual), torch.ones_like(noise))
+    follower = detections.follower
+    return Lasting(
+        shift.lasting_variance(follower, used, _SHIFT_LAGS, shift_of_each),
+        size.lasting_variance(follower, used, _SIZE_LAGS),
+    )
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """What each detection has wrong as a whole, and how it counts."""
+
+    error: Float[Tensor, "d k"]
+    weight: Float[Tensor, " d"]
+
+    def lasting_variance(
+        self,
+        follower: Int[Tensor, " d"],
+        used: Bool[Tensor, " d"],
+        lags: int,
+        of_each: Float[Tensor, ""] | None = None,
+    ) -> Float[Tensor, ""]:
+        """Variance of the mean of many successive errors, times their number, with that `of_each` alone.
+
+        None: that is the covariance of one with the next, as noise is no part of what lasts. The sum of the covariances of
+        detections ever further apart in their tracks, as long as they are positive (Geyer,
+        Practical Markov Chain Monte Carlo, 1992).
+        """
+        if not bool(used.any()):
+            return self.weight.new_zeros(())
+        weight = torch.where(used, self.weight, 0.0)
+        error = weight[:, None] * self.error
+        bound = _CLIP * torch.stack([median_scale(x) for x in error[used].unbind(1)])
+        error = torch.minimum(torch.maximum(error, -bound), bound)
+        total, goes_on, later = of_each, weight.new_ones(()), follower
+        for _ in range(lags):
+            has = later >= 0
+            pairs = (weight * weight[later] * has).sum()
+            together = (error * error[later]).mean(1) * has
+            together = together.sum() / pairs.clamp_min(_LEAST)
+            total = together if total is None else total
+            goes_on = goes_on * (together > 0)
+            total = total + 2 * goes_on * together
+            later = torch.where(has, follower[later], -1)
+        assert total is not None
+        return total.clamp_min(0)
+
+
+def _size_errors(
+    detections: CornerDetections,
+    rows: CornerObservations,
+    residual: Float[Tensor, "m 2"],
+    noise: Float[Tensor, " d"],
+    used: Bool[Tensor, " d"],
+) -> _Errors:
+    """By what share the outline of every detection is too large, where corners' own `noise` is so much [px^2].
+
+    Beside the mean of those of its sign in its drive: what is wrong all along, as signs that are larger or nearer than they
+    are taken to be, or others that are taken for them, is no trembling.
+    """
+    about, spread = _about_middle(detections, rows.px)
+    spread = spread.sum(1)
+    has_size = spread > 0
+    spread = torch.where(has_size, spread, 1.0)
+    own, counts = noise / spread, has_size & used
+    usual = own[counts].median() if bool(counts.any()) else own.sum()
+    weight = torch.where(has_size, 1 / (own + usual).clamp_min(_LEAST), 0.0)
+    of_corners = (about * residual).sum(1, keepdim=True)
+    share = detections.count * detections.mean(of_corners)[:, 0] / spread
+    first, say = detections.first, torch.where(used, weight, 0.0)
+    both = torch.stack((rows.sign[first], rows.journey[first]), dim=1)
+    _, track = torch.unique(both, dim=0, return_inverse=True)
+    sums = group_sum(torch.stack((say * share, say), dim=1), track, int(track.max()) + 1)
+    mean = sums[:, 0] / sums[:, 1].clamp_min(_LEAST)
+    return _Errors((share - mean[track])[:, None], weight)
+
+
+def _about_middle(
+    detections: CornerDetections, px: Float[Tensor, "m 2"]
+) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "d 2"]]:
+    """Corners from the middle of their detection [px], and the sum of squares over each."""
+    about = px - detections.mean(px)[detections.run]
+    return about, detections.count[:, None] * detections.mean(about.square())

@@ -169,7 +169,8 @@ def _cost(summary: Mapping[str, TermSummary]) -> float:
 def _scales(bundle: Bundle) -> dict[str, float]:
     names = ("sign_px", "lane_px", "lane_correlation")
     scales = dict(zip(names, bundle.scale.tolist(), strict=True))
-    return {**scales, "lasting_px": math.sqrt(float(bundle.lasting))}
+    lasting = {"lasting_px": bundle.lasting, "lasting_size": bundle.lasting_size}
+    return {**scales, **{name: math.sqrt(float(variance)) for name, variance in lasting.items()}}
 
 
 def corner_residuals(bundle: Bundle) -> Float[Tensor, "m 2"]:

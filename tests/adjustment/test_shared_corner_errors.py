@@ -13,8 +13,9 @@ from torch import Tensor
 from crowdmap_torch.adjustment.bundle import Bundle, Evidence
 from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.adjustment.shared_corner_errors import (
+    Lasting,
     corner_detections,
-    lasting_variance,
+    lasting_errors,
     shared_errors,
 )
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 F64 = torch.float64
 _VIEWS, _SIGNS, _JOURNEYS, _CORNERS = 60, 5, 6, 4
+_SIDE_PX, _NOISE_PX = 40.0, 0.5
 
 
 def rows() -> CornerObservations:
@@ -33,10 +35,11 @@ def rows() -> CornerObservations:
     sign = torch.arange(_SIGNS).repeat_interleave(_CORNERS).repeat(_JOURNEYS * _VIEWS)
     m = len(detection)
     zero = torch.zeros(m, dtype=F64)
+    outline = torch.tensor([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=F64) * _SIDE_PX / 2
     return CornerObservations(
         frame=frame,
         lens=torch.zeros_like(frame),
-        px=torch.zeros(m, 2, dtype=F64),
+        px=outline.repeat(count, 1) + 300.0,
         ideal=torch.zeros(m, 2, dtype=F64),
         bend=torch.zeros(m, 2, dtype=F64),
         matrix=torch.zeros(m, 3, 3, dtype=F64),
@@ -49,14 +52,26 @@ def rows() -> CornerObservations:
     )
 
 
-def errors(shift: float, lasts: float, seed: int) -> Tensor:
-    """Corners' noise of half a pixel, and shifts of which the share `lasts` is still there a frame later."""
-    g = torch.Generator().manual_seed(seed)
-    push = torch.randn(_JOURNEYS, _VIEWS, _SIGNS, 2, generator=g, dtype=F64)
+def pushes(numbers: int, lasts: float, g: torch.Generator) -> Tensor:
+    """What pushes every detection, of variance one, by so many numbers: a share of it is still there a frame later."""
+    push = torch.randn(_JOURNEYS, _VIEWS, _SIGNS, numbers, generator=g, dtype=F64)
     for view in range(1, _VIEWS):
         push[:, view] = lasts * push[:, view - 1] + (1 - lasts**2) ** 0.5 * push[:, view]
-    together = shift * push.reshape(-1, 2).repeat_interleave(_CORNERS, 0)
-    return together + 0.5 * torch.randn(len(together), 2, generator=g, dtype=F64)
+    return push.reshape(-1, numbers).repeat_interleave(_CORNERS, 0)
+
+
+def errors(shift: float, lasts: float, seed: int, size: float = 0.0) -> Tensor:
+    """Corners' noise of half a pixel; shifts, and shares by which outlines are too large, that last."""
+    g = torch.Generator().manual_seed(seed)
+    together = shift * pushes(2, lasts, g) + size * pushes(1, lasts, g) * (rows().px - 300.0)
+    return together + _NOISE_PX * torch.randn(len(together), 2, generator=g, dtype=F64)
+
+
+def lasting(table: CornerObservations, error: Tensor, used: Tensor, of_each: float) -> Lasting:
+    """What is found to last of errors of corners."""
+    noise = torch.full(used.shape, _NOISE_PX**2 / _CORNERS, dtype=F64)
+    of_shift = torch.tensor(of_each, dtype=F64)
+    return lasting_errors(corner_detections(table), table, error, noise, used, of_shift)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -64,11 +79,26 @@ def errors(shift: float, lasts: float, seed: int) -> Tensor:
 def test_what_lasts_is_the_variance_of_long_means(shift: float, lasts: float, seed: int):
     table = rows()
     used = torch.ones(len(table) // _CORNERS, dtype=torch.bool)
-    of_each = torch.tensor(shift**2, dtype=F64)
-    error = errors(shift, lasts, seed)
-    found = lasting_variance(corner_detections(table), error, used, of_each)
+    found = lasting(table, errors(shift, lasts, seed), used, shift**2)
     expected = shift**2 * (1 + lasts) / (1 - lasts)
-    assert abs(float(found) - expected) < 0.25 * expected + 0.03
+    assert abs(float(found.shift) - expected) < 0.25 * expected + 0.03
+    # A shift is no size.
+    assert float(found.size) < 2e-5
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("size", "lasts"), [(0.02, 0.0), (0.02, 0.8)])
+def test_sizes_that_last_are_told_from_shifts_and_from_signs_that_are_larger(
+    size: float, lasts: float, seed: int
+):
+    table = rows()
+    used = torch.ones(len(table) // _CORNERS, dtype=torch.bool)
+    larger = 0.1 * torch.arange(_SIGNS, dtype=F64)[table.sign, None] * (table.px - 300.0)
+    found = lasting(table, errors(0.0, lasts, seed, size) + larger, used, 0.0)
+    # Beside the mean of sixty views more than half of what lasts for nine shows; of what does not last nothing does.
+    expected = 0.57 * size**2 * (1 + lasts) / (1 - lasts) if lasts else 0.0
+    assert abs(float(found.size) - expected) < 0.35 * expected + 1e-4
+    assert float(found.shift) < 0.03
 
 
 def test_outliers_and_what_is_given_up_do_not_matter():
@@ -79,9 +109,9 @@ def test_outliers_and_what_is_given_up_do_not_matter():
     for counted in (~wild, torch.ones_like(wild)):
         used = detections.have(counted)
         assert int(used.sum()) == int(counted.sum()) // _CORNERS
-        found = lasting_variance(detections, error, used, torch.zeros((), dtype=F64))
-        assert float(found) < 0.15
-    assert not lasting_variance(detections, error, used & False, torch.ones((), dtype=F64))
+        assert float(lasting(table, error, used, 0.0).shift) < 0.15
+    none = lasting(table, error, used & False, 1.0)
+    assert not none.shift and not none.size
 
 
 def test_detections_of_other_signs_drives_and_kinds_do_not_follow_each_other():
@@ -100,16 +130,21 @@ def test_detections_of_other_signs_drives_and_kinds_do_not_follow_each_other():
     assert (twice.follower[used] % 2 == torch.nonzero(used)[:, 0] % 2).all()
 
 
-def test_what_lasts_takes_off_the_say_of_the_mean_alone():
+def test_what_lasts_takes_off_the_say_of_the_mean_and_of_the_size_alone():
     table = rows()
-    found = corner_detections(table)
     sigma = torch.full((len(table),), 0.5, dtype=F64)
-    shared = shared_errors(found, sigma, torch.tensor(3.0, dtype=F64))
+    lasts = Lasting(torch.tensor(3.0, dtype=F64), torch.tensor(1e-4, dtype=F64))
+    shared = shared_errors(corner_detections(table), table.px, sigma, lasts)
     shift = torch.ones(2, len(table), dtype=F64)
     expected = (1 + _CORNERS * 3.0 / 0.25) ** -0.5
     torch.testing.assert_close(shared.whiten(shift), expected * shift)
-    sides = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=F64).repeat(len(table) // 4).expand(2, -1)
-    torch.testing.assert_close(shared.whiten(sides), sides)
+    larger = (table.px - 300.0).T.contiguous()
+    # One size alone, of the variance that it has, would be told as well by u and v together.
+    spread = 2 * _CORNERS * (_SIDE_PX / 2) ** 2
+    expected = (1 + spread * 1e-4 / 0.25) ** -0.5
+    torch.testing.assert_close(shared.whiten(larger), expected * larger)
+    wedge = larger.flip(0).contiguous() * torch.sign(larger)
+    torch.testing.assert_close(shared.whiten(wedge), wedge)
 
 
 def with_boxes(bundle: Bundle, share: float, seed: int) -> Bundle:
@@ -133,6 +168,7 @@ def with_boxes(bundle: Bundle, share: float, seed: int) -> Bundle:
     changed.see(replace(rows, **observed))
     changed.given_up = torch.zeros(int(number.max()) + 1, dtype=torch.bool)
     changed.lasting.zero_()
+    changed.lasting_size.zero_()
     # As if poses were known: each shift is its own innovation.
     known = torch.full((len(changed.innovation), 2), 1e-6, dtype=F64)
     square = changed.detections.mean(error).square().mean(1)

@@ -49,7 +49,9 @@ def test_a_step_ends_below_where_it_began_in_its_own_scales(watched):
     watch, _, _ = watched
     for step in watch.iterations:
         assert step.cost_before > step.total if step.accepted else step.cost_before == step.total
-        assert set(step.scale) == {"sign_px", "lane_px", "lane_correlation", "lasting_px"}
+        assert set(step.scale) == {
+            *("sign_px", "lane_px", "lane_correlation", "lasting_px", "lasting_size")
+        }
     for step, following in pairwise(watch.iterations):
         assert step.cost_after == following.cost_before
     # Scales narrow after the first step: the same errors are more of them.
