@@ -158,11 +158,12 @@ class _Errors:
         detections ever further apart in their tracks, as long as they are positive (Geyer,
         Practical Markov Chain Monte Carlo, 1992).
         """
-        if not bool(used.any()):
+        counted = used & (self.weight > 0)
+        if not bool(counted.any()):
             return self.weight.new_zeros(())
-        weight = torch.where(used, self.weight, 0.0)
+        weight = torch.where(counted, self.weight, 0.0)
         error = weight[:, None] * self.error
-        bound = _CLIP * torch.stack([median_scale(x) for x in error[used].unbind(1)])
+        bound = _CLIP * torch.stack([median_scale(x) for x in error[counted].unbind(1)])
         error = torch.minimum(torch.maximum(error, -bound), bound)
         total, goes_on, later = of_each, weight.new_ones(()), follower
         for _ in range(lags):

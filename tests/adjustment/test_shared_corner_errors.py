@@ -99,6 +99,16 @@ def test_sizes_that_last_are_told_from_shifts_and_from_signs_that_are_larger(
     expected = 0.57 * size**2 * (1 + lasts) / (1 - lasts) if lasts else 0.0
     assert abs(float(found.size) - expected) < 0.35 * expected + 1e-4
     assert float(found.shift) < 0.03
+    # Centres of boxes, which have no size, change nothing.
+    centres = torch.arange(len(table)) % _CORNERS == 0
+    more = replace(
+        table, **{name: torch.cat((of, of[centres])) for name, of in vars(table).items()}
+    )
+    alone = table.detection[centres] + 1
+    more = replace(more, detection=torch.cat((table.detection, alone)))
+    error = errors(0.0, lasts, seed, size) + larger
+    beside = lasting(more, torch.cat((error, error[centres])), used.repeat(2), 0.0)
+    torch.testing.assert_close(beside.size, found.size)
 
 
 def test_outliers_and_what_is_given_up_do_not_matter():
