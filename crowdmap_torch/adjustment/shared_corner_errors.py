@@ -127,14 +127,16 @@ def lasting_errors(
     """What lasts by the errors [px] of corners; detections that are not `used` are left out.
 
     `noise` is what corners' own makes of the mean of a detection, `shift_of_each` the variance of a single shift, both
-    [px^2]: poses hide that.
+    [px^2]: poses hide that. Of sizes nothing lasts where that is less than noise makes of the size of one detection: it is
+    told no better, and costs time and memory.
     """
-    size = _size_errors(detections, rows, residual, detections.count * noise, used)
+    size, usual = _size_errors(detections, rows, residual, detections.count * noise, used)
     shift = _Errors(detections.mean(residual), torch.ones_like(noise))
     follower = detections.follower
+    of_size = size.lasting_variance(follower, used, _SIZE_LAGS)
     return Lasting(
         shift.lasting_variance(follower, used, _SHIFT_LAGS, shift_of_each),
-        size.lasting_variance(follower, used, _SIZE_LAGS),
+        torch.where(of_size > usual, of_size, 0.0),
     )
 
 
@@ -185,8 +187,8 @@ def _size_errors(
     residual: Float[Tensor, "m 2"],
     noise: Float[Tensor, " d"],
     used: Bool[Tensor, " d"],
-) -> _Errors:
-    """By what share the outline of every detection is too large, where corners' own `noise` is so much [px^2].
+) -> tuple[_Errors, Float[Tensor, ""]]:
+    """By what share the outline of every detection is too large, and the variance that its corners' `noise` [px^2] makes.
 
     Beside the mean of those of its sign in its drive: what is wrong all along, as signs that are larger or nearer than they
     are taken to be, or others that are taken for them, is no trembling.
@@ -205,7 +207,7 @@ def _size_errors(
     _, track = torch.unique(both, dim=0, return_inverse=True)
     sums = group_sum(torch.stack((say * share, say), dim=1), track, int(track.max()) + 1)
     mean = sums[:, 0] / sums[:, 1].clamp_min(_LEAST)
-    return _Errors((share - mean[track])[:, None], weight)
+    return _Errors((share - mean[track])[:, None], weight), usual
 
 
 def _about_middle(
