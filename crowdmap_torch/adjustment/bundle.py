@@ -319,7 +319,7 @@ class Bundle(BundleState):
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, ""], Bool[Tensor, " 2"]]:
         """What lasts of shifts and of sizes by the errors of all, what share of poses' is there, and whether both rest.
 
-        From the second time on either goes half of the way to where it is found: it is found by what it was.
+        From the second time on shifts and that share go half of the way to where they are found, by what they were.
         """
         if not len(of_corners):
             return self.lasting, self.lasting_size, self.share_there, self.given_up.new_ones(2)

@@ -27,6 +27,9 @@ from crowdmap_torch.processes.at_rest import rest
 from crowdmap_torch.processes.together import ALONE
 from crowdmap_torch.tables import to_device
 
+_SIZE_FELT = 0.01
+"""Root of what lasts of detections' sizes, below which a change of it is no change of scales."""
+
 
 class BundleState(nn.Module):
     """The unknowns of bundle adjustment and all observations of them.
@@ -241,7 +244,7 @@ class BundleState(nn.Module):
     def scales(self) -> Float[Tensor, " s"]:
         """All scales that weigh observations and the prior, and how often detections were judged."""
         corner = (self.scale[0].square() + self.lasting).sqrt()
-        size = 0.01 + self.lasting_size.sqrt()
+        size = _SIZE_FELT + self.lasting_size.sqrt()
         of_pixels = (self.scale[1:], corner[None], size[None], 1.0 + self.judged[None])
         return torch.cat((self.prior_scale.flatten(), self.white_scale.flatten(), *of_pixels))
 

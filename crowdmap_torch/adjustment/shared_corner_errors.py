@@ -157,8 +157,8 @@ class _Errors:
         """Variance of the mean of many successive errors, times their number, with that `of_each` alone.
 
         None: that is the covariance of one with the next, as noise is no part of what lasts. The sum of the covariances of
-        detections ever further apart in their tracks, as long as they are positive (Geyer,
-        Practical Markov Chain Monte Carlo, 1992).
+        detections ever further apart in their tracks, as long as they are positive (Geyer, Practical Markov Chain Monte
+        Carlo, 1992).
         """
         counted = used & (self.weight > 0)
         if not bool(counted.any()):

@@ -192,9 +192,8 @@ def _beside(
     T_world_camera: Float[Tensor, "f 4 4"], place: Sequence[float]
 ) -> Float[Tensor, "f 4 4"]:
     """Poses of a camera at a place in the axes of the given one [m], turned as it is."""
-    T_camera_other = torch.eye(4).to(T_world_camera)
-    T_camera_other[:3, 3] = torch.tensor(place)
-    return T_world_camera @ T_camera_other
+    turn = torch.eye(3).to(T_world_camera)
+    return T_world_camera @ se3.make(turn, T_world_camera.new_tensor(place))
 
 
 def _means(by_drive: Sequence[dict[str, float]]) -> dict[str, float]:
