@@ -60,8 +60,6 @@ _TOLD_HOLDS = 0.02
 """What observations tell of poses' errors is found anew where any scale has changed by more than this share since."""
 _WHITE_RESTS = 0.03
 """A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
-_LASTING_RESTS = 0.2
-"""The variance of a detection's shift that would change by less than this share is at rest."""
 _SHARE_RESTS = 0.2
 """The share of poses' errors that is there is at rest where it changes by less than this: by as much of a small pull."""
 
@@ -293,11 +291,11 @@ class Bundle(BundleState):
         corners, *lanes = narrows.tolist()
         if corners or not foreseen or self.config.method == "paper2017":
             return not corners, not any(lanes)
-        lasting, size, share, rests = self.together.of_all(
+        of_many, of_each, share, rests = self.together.of_all(
             self._seen_lasting, of_corners, self.innovation
         )
-        self.lasting.copy_(lasting)
-        self.lasting_size.copy_(size)
+        self.lasting.copy_(of_many)
+        self.lasting_each.copy_(of_each)
         self.share_there.copy_(share)
         lasting_rests, share_rests = rests.tolist()
         return lasting_rests, share_rests and not any(lanes)
@@ -316,13 +314,14 @@ class Bundle(BundleState):
 
     def _seen_lasting(
         self, of_corners: Float[Tensor, "m 2"], innovation: Float[Tensor, "d 3"]
-    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, ""], Bool[Tensor, " 2"]]:
+    ) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"], Float[Tensor, ""], Bool[Tensor, " 2"]]:
         """What lasts of shifts and of sizes by the errors of all, what share of poses' is there, and whether both rest.
 
         From the second time on shifts and that share go half of the way to where they are found, by what they were.
         """
+        before = Lasting(self.lasting, self.lasting_each)
         if not len(of_corners):
-            return self.lasting, self.lasting_size, self.share_there, self.given_up.new_ones(2)
+            return before.of_many, before.of_each, self.share_there, self.given_up.new_ones(2)
         rows, detections = self.whole.corners, self.whole.detections
         # Corners of boxes tell little of it, and would hide that of outlines; the centre of a box counts.
         used = detections.have(~self.given_up[rows.detection] & (rows.loose_px == 0))
@@ -331,20 +330,14 @@ class Bundle(BundleState):
         # Errors that are larger than they are taken to be are so until the scales have found them.
         share = share.clamp_max(1.0)
         found = lasting_errors(detections, rows, of_corners, noise, used, of_each)
-        shift, before = found.shift, self.lasting
-        shift_rests = (shift - before).abs() <= _LASTING_RESTS * (shift + noise.mean())
-        # Told once, of a fit that has come to rest: where sizes count for less, their errors show what else is wrong.
-        is_told = (self.lasting_size > 0) | (self.judged == 0)
-        size = torch.where(is_told, self.lasting_size, found.size)
-        rest = shift_rests & (size == self.lasting_size)
+        # Of sizes it is told once, of a fit that has come to rest: where they count for less, their errors show what else is
+        # wrong.
+        is_told = (before.of_many[1] > 0) | (self.judged == 0)
+        far = torch.where(self.share_there == 1, 1.0, 0.5).to(share)
+        now, rests = before.toward(found, far, noise.mean(), is_told)
         share_rests = (share - self.share_there).abs() <= _SHARE_RESTS
-        far = torch.where(self.share_there == 1, 1.0, 0.5)
-        return (
-            torch.where(shift_rests, before, torch.lerp(before, shift, far)),
-            size,
-            torch.lerp(self.share_there, share, far),
-            torch.stack((rest, share_rests)),
-        )
+        share = torch.lerp(self.share_there, share, far)
+        return now.of_many, now.of_each, share, torch.stack((rests, share_rests))
 
     def problem(self) -> Problem:
         """The least-squares problem with the matches and scales of the moment, lanes held where they are.
@@ -416,9 +409,13 @@ class Bundle(BundleState):
             loss,
             reprojection.sign_reprojection_jacobian,
         )
-        lasting = Lasting(self.lasting, self.lasting_size)
-        if isinstance(sigma, Tensor) and bool(lasting.shift + lasting.size > 0):
-            term = replace(term, shared=shared_errors(self.detections, rows.px, sigma, lasting))
+        if isinstance(sigma, Tensor):
+            lasting, counted = (
+                Lasting(self.lasting, self.lasting_each),
+                ~self.given_up[rows.detection],
+            )
+            how = rows.px, sigma, lasting, self.detections.have(counted)
+            term = replace(term, shared=shared_errors(self.detections, *how))
         return {"sign_reprojection": self.fleet.of_corners(term, rows, self._by_optics[0])}
 
     def _loss_of_detections(self) -> JointTukey:

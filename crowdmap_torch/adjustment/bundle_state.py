@@ -50,9 +50,10 @@ class BundleState(nn.Module):
     small_box: Tensor
     """Box [px] at which a corner's standard deviation is 1.41 times that of a large box."""
     lasting: Tensor
-    """Variance [px^2] of a detection's shift, in the mean of many successive ones, beyond its corners' noise."""
-    lasting_size: Tensor
-    """Likewise of the share by which a detection is too large."""
+    """Variance [px^2] of a detection's shift, in the mean of many successive ones, beyond its corners' noise; likewise of
+    the share by which a detection is too large."""
+    lasting_each: Tensor
+    """The same of single ones."""
     judged: Tensor
     """How often detections were judged by everything else."""
     given_up: Tensor
@@ -106,8 +107,8 @@ class BundleState(nn.Module):
             self.register_parameter(f"delta_{name}", nn.Parameter(increment))
         self.register_buffer("scale", values["pose"].new_full((3,), torch.inf))
         self.register_buffer("small_box", torch.zeros_like(self.scale[0]))
-        self.register_buffer("lasting", torch.zeros_like(self.scale[0]))
-        self.register_buffer("lasting_size", torch.zeros_like(self.scale[0]))
+        self.register_buffer("lasting", torch.zeros_like(self.scale[:2]))
+        self.register_buffer("lasting_each", torch.zeros_like(self.lasting))
         last = int(corners.detection.max()) + 1 if len(corners) else 0
         last = last if shared_out is None else shared_out.detections
         given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
@@ -125,7 +126,7 @@ class BundleState(nn.Module):
         self.register_buffer("poses_left", values["pose"].new_zeros(len(values["pose"]), 6))
         self.register_buffer("held_off", values["pose"].new_zeros(0))
         self.register_buffer("innovation", values["pose"].new_zeros(0, 3))
-        self.register_buffer("share_there", torch.ones_like(self.lasting))
+        self.register_buffer("share_there", torch.ones_like(self.scale[0]))
         self.register_buffer("told_at", torch.full_like(self.scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         # Their matrices are the bundle's own: lenses are taken anew in place.
@@ -243,8 +244,8 @@ class BundleState(nn.Module):
 
     def scales(self) -> Float[Tensor, " s"]:
         """All scales that weigh observations and the prior, and how often detections were judged."""
-        corner = (self.scale[0].square() + self.lasting).sqrt()
-        size = _SIZE_FELT + self.lasting_size.sqrt()
+        corner = (self.scale[0].square() + self.lasting[0]).sqrt()
+        size = _SIZE_FELT + self.lasting[1].sqrt()
         of_pixels = (self.scale[1:], corner[None], size[None], 1.0 + self.judged[None])
         return torch.cat((self.prior_scale.flatten(), self.white_scale.flatten(), *of_pixels))
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from crowdmap_torch.adjustment.bundle import Bundle
 
 _SCALES = (
-    *("scale", "small_box", "lasting", "lasting_size", "share_there"),
+    *("scale", "small_box", "lasting", "lasting_each", "share_there"),
     *("prior_scale", "drift_told", "white_scale", "calibration_scale", "calibration_far"),
 )
 """What a bundle keeps of noise: of pixels, of poses and of cars."""

@@ -2,8 +2,12 @@
 
 All corners of a detection are off to one side, or all away from their middle, and still are in the next frame: views of a
 sign in one drive are worth fewer than there are. How much fewer shows in the misfits of successive detections of a sign,
-which noise of single corners and of single poses does not join. In the solver detections err independently; what lasts is
-counted as so much variance more as the mean of many successive ones has: its spectral density at low frequencies.
+which noise of single corners and of single poses does not join.
+
+In the solver detections err independently. Each counts for so much as it does in the mean of its track, weighed by all
+covariances: those in between say what the mean of many successive ones does, by the spectral density at low frequencies,
+and the first and the last ones far more, as nothing beyond them errs alike. It is the last view of a sign, from near, that
+tells most of where it is.
 """
 
 from __future__ import annotations
@@ -18,12 +22,17 @@ from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.clustering.groups import group_sum
 from crowdmap_torch.optim.robust import median_scale
 from crowdmap_torch.optim.shared_errors import SharedErrors
+from crowdmap_torch.optim.tridiagonal import solve_tridiagonal
 
 _SHIFT_LAGS, _SIZE_LAGS = 30, 90
 """Detections of a track that are this far apart are taken to be shifted, and too large, independently: what lasts longer of
 a shift poses take up."""
+_RESTS = 0.2
+"""The variance of a detection's shift that would change by less than this share is at rest."""
 _LEAST = 1e-30
 """Far below any weight or square of pixels."""
+_LEAST_OF_MANY = 1 / (1 + 2 * _SHIFT_LAGS)
+"""Share of the variance of many that a single one's is, at least: as if all whose covariances count erred alike."""
 _CLIP = 3.0
 """Standard deviations at which misfits are clipped before they are compared."""
 
@@ -42,8 +51,14 @@ class CornerDetections:
     """Rows of each detection."""
     first: Int[Tensor, " d"]
     """Its first row."""
+    frame: Int[Tensor, " d"]
+    """Where its camera is."""
+    order: Int[Tensor, " d"]
+    """All detections, those of a track one after the other."""
+    track: Int[Tensor, " d"]
+    """Track of each detection, counted up by one along `order`: views of a sign in one drive."""
     follower: Int[Tensor, " d"]
-    """The next detection of each one's sign in its journey; -1: there is none."""
+    """The next detection of each one's track; -1: there is none."""
 
     def have(self, counted: Bool[Tensor, " m"]) -> Bool[Tensor, " d"]:
         """The detections of which all rows are counted."""
@@ -86,18 +101,43 @@ def corner_detections(rows: CornerObservations) -> CornerDetections:
     same &= journey[before] == journey[after]
     follower = torch.full_like(order, -1)
     follower[before] = torch.where(same, after, -1)
+    track = torch.zeros_like(order)
+    track[after] = (~same).cumsum(0)
     most = int(count.max()) if len(count) else 0
-    return CornerDetections(run, rank, most, count.to(rows.px), first, follower)
+    return CornerDetections(
+        run, rank, most, count.to(rows.px), first, rows.frame[first], order, track, follower
+    )
 
 
 @dataclass(frozen=True)
 class Lasting:
-    """Variances of the means of many successive errors of detections, times their number."""
+    """What detections have wrong as a whole: shifts to one side, in u and in v each [px^2], and of size, as shares of it."""
 
-    shift: Float[Tensor, ""]
-    """To one side, in u and in v each [px^2]."""
-    size: Float[Tensor, ""]
-    """Of their size, as shares of it."""
+    of_many: Float[Tensor, " 2"]
+    """Variances of the means of many successive errors, times their number."""
+    of_each: Float[Tensor, " 2"]
+    """Variances of single errors; never more than those."""
+
+    def toward(
+        self,
+        found: Lasting,
+        far: Float[Tensor, ""],
+        noise: Float[Tensor, ""],
+        sizes_are_told: Bool[Tensor, ""],
+    ) -> tuple[Lasting, Bool[Tensor, ""]]:
+        """On the way to what was `found`, and whether nothing changes: shifts go so `far`, sizes all of it if they go.
+
+        Shifts rest where they change by little beside themselves and what `noise` makes of the mean of a detection [px^2].
+        """
+        change = (found.of_many - self.of_many).abs()
+        shifts_rest = change[0] <= _RESTS * (found.of_many[0] + noise)
+        rest = torch.stack((shifts_rest, sizes_are_told))
+        goes = torch.where(rest, 0.0, torch.stack((far, torch.ones_like(far))))
+        now = Lasting(
+            torch.lerp(self.of_many, found.of_many, goes),
+            torch.lerp(self.of_each, found.of_each, goes),
+        )
+        return now, (rest | (change == 0)).all()
 
 
 def shared_errors(
@@ -105,15 +145,74 @@ def shared_errors(
     px: Float[Tensor, "m 2"],
     sigma: Float[Tensor, " m"],
     lasting: Lasting,
-) -> SharedErrors:
-    """How corners at `px` with a noise of `sigma` [px] each weigh together where some of what they err by lasts."""
-    of, count = detections.run, detections.count[:, None].expand(-1, 2)
-    about, spread = _about_middle(detections, px)
-    pattern = torch.stack((count.rsqrt()[of], about * spread.clamp_min(_LEAST).rsqrt()[of]), dim=-1)
-    # Size counts in u and in v by itself, as if each erred on its own: together they then tell of it what one would.
-    variance = torch.stack((count * lasting.shift, 2 * spread * lasting.size), dim=-1)
-    keep = (1 + variance[of] / sigma.square()[:, None, None]).rsqrt()
-    return SharedErrors(of, detections.rank, detections.most, pattern, keep)
+    counted: Bool[Tensor, " d"],
+) -> SharedErrors | None:
+    """How corners at `px` with a noise of `sigma` [px] each weigh together where some of what they err by lasts.
+
+    None: nothing does. Detections that are `counted` alone have a say.
+    """
+    # One number from where they are.
+    last = lasting.of_many > 0
+    kinds = int(last[0] + 2 * last[1])
+    shifts, sizes = bool(kinds & 1), bool(kinds & 2)
+    patterns, known = [], []
+    of, count, precision = detections.run, detections.count[:, None], _precision(detections, sigma)
+    if shifts:
+        patterns.append(count.rsqrt()[of].expand(-1, 2))
+        known.append((count * precision).expand(-1, 2))
+    if sizes:
+        about, spread = _about_middle(detections, px)
+        patterns.append(about * spread.clamp_min(_LEAST).rsqrt()[of])
+        # Size counts in u and in v by itself, as if each erred on its own: together they then tell of it what one would.
+        known.append(2 * spread * precision)
+    if not patterns:
+        return None
+    of_kind = slice(0 if shifts else 1, 2 if sizes else 1)
+    lasts = Lasting(lasting.of_many[of_kind], lasting.of_each[of_kind])
+    kept = kept_in_tracks(detections, torch.stack(known, dim=-1), lasts, counted)
+    return SharedErrors(
+        of, detections.rank, detections.most, torch.stack(patterns, dim=-1), kept.sqrt()[of]
+    )
+
+
+def kept_in_tracks(
+    detections: CornerDetections,
+    precision: Float[Tensor, "d n k"],
+    lasting: Lasting,
+    counted: Bool[Tensor, " d"],
+) -> Float[Tensor, "d n k"]:
+    """What is left of the `precision` of errors of k kinds, where they last as their `lasting` says.
+
+    Errors of a track are a Gauss-Markov process with these two variances, by frames, beside white noise of that precision.
+    Of a number that all of them show, with covariances R, the best estimate weighs them by R^-1 1: so does, each for itself,
+    a share of their precision. It is never less than half of what is left among many others, nor more than if it was alone.
+    """
+    share = (lasting.of_each / lasting.of_many.clamp_min(_LEAST)).clamp(_LEAST_OF_MANY, 1.0)
+    alone = share * lasting.of_many * precision
+    least = 1 / (1 + lasting.of_many * precision)
+    order = detections.order[counted[detections.order]]
+    if not len(order):
+        return least
+    before, after = order[:-1], order[1:]
+    track, frame = detections.track[after], detections.frame
+    apart = (frame[after] - frame[before]).clamp_min(1)
+    follows = (detections.track[before] == track) & (apart <= _SHIFT_LAGS)
+    # What lasts is told from one detection to the next, however often a detector misses a sign.
+    ones = torch.stack((follows * apart, follows.long()), dim=1).to(precision)
+    usual = group_sum(ones, track, int(detections.track.max()) + 1)
+    usual = (usual[:, 0] / usual[:, 1].clamp_min(1))[track]
+    lasts = ((1 - share) / (1 + share)) ** (apart / usual.clamp_min(1))[:, None]
+    lasts = torch.where(follows[:, None], lasts, 0.0)[:, None]
+    # In the inverse of the process's correlations neighbours alone are joined.
+    more, zero = lasts.square() / (1 - lasts.square()), lasts.new_zeros(1, 1, lasts.shape[-1])
+    diagonal = 1 + torch.cat((zero, more)) + torch.cat((more, zero))
+    beside = torch.cat((-lasts / (1 - lasts.square()), zero))
+    _, length = detections.track[order].unique_consecutive(return_counts=True)
+    own = alone[order]
+    process = solve_tridiagonal(diagonal + own, beside.expand_as(own), own, int(length.max()))
+    kept = least.clone()
+    kept[order] = torch.maximum(least[order] / 2, torch.minimum(1 - process, 1 / (1 + own)))
+    return kept
 
 
 def lasting_errors(
@@ -133,11 +232,10 @@ def lasting_errors(
     size, usual = _size_errors(detections, rows, residual, detections.count * noise, used)
     shift = _Errors(detections.mean(residual), torch.ones_like(noise))
     follower = detections.follower
+    of_shift = shift.lasting_variance(follower, used, _SHIFT_LAGS, shift_of_each)
     of_size = size.lasting_variance(follower, used, _SIZE_LAGS)
-    return Lasting(
-        shift.lasting_variance(follower, used, _SHIFT_LAGS, shift_of_each),
-        torch.where(of_size > usual, of_size, 0.0),
-    )
+    of_size = torch.where(of_size[0] > usual, of_size, 0.0)
+    return Lasting(*torch.stack((of_shift, of_size), dim=1).unbind())
 
 
 @dataclass(frozen=True)
@@ -153,8 +251,8 @@ class _Errors:
         used: Bool[Tensor, " d"],
         lags: int,
         of_each: Float[Tensor, ""] | None = None,
-    ) -> Float[Tensor, ""]:
-        """Variance of the mean of many successive errors, times their number, with that `of_each` alone.
+    ) -> Float[Tensor, " 2"]:
+        """Variance of the mean of many successive errors, times their number, with that `of_each` alone; and that.
 
         None: that is the covariance of one with the next, as noise is no part of what lasts. The sum of the covariances of
         detections ever further apart in their tracks, as long as they are positive (Geyer, Practical Markov Chain Monte
@@ -162,23 +260,25 @@ class _Errors:
         """
         counted = used & (self.weight > 0)
         if not bool(counted.any()):
-            return self.weight.new_zeros(())
+            return self.weight.new_zeros(2)
         weight = torch.where(counted, self.weight, 0.0)
         error = weight[:, None] * self.error
         bound = _CLIP * torch.stack([median_scale(x) for x in error[counted].unbind(1)])
         error = torch.minimum(torch.maximum(error, -bound), bound)
-        total, goes_on, later = of_each, weight.new_ones(()), follower
+        each = total = of_each
+        goes_on, later = weight.new_ones(()), follower
         for _ in range(lags):
             has = later >= 0
             pairs = (weight * weight[later] * has).sum()
             together = (error * error[later]).mean(1) * has
             together = together.sum() / pairs.clamp_min(_LEAST)
-            total = together if total is None else total
+            if each is None or total is None:
+                each = total = together
             goes_on = goes_on * (together > 0)
             total = total + 2 * goes_on * together
             later = torch.where(has, follower[later], -1)
-        assert total is not None
-        return total.clamp_min(0)
+        assert each is not None and total is not None
+        return torch.stack((total, each)).clamp_min(0)
 
 
 def _size_errors(
@@ -202,12 +302,15 @@ def _size_errors(
     weight = torch.where(has_size, 1 / (own + usual).clamp_min(_LEAST), 0.0)
     of_corners = (about * residual).sum(1, keepdim=True)
     share = detections.count * detections.mean(of_corners)[:, 0] / spread
-    first, say = detections.first, torch.where(used, weight, 0.0)
-    both = torch.stack((rows.sign[first], rows.journey[first]), dim=1)
-    _, track = torch.unique(both, dim=0, return_inverse=True)
+    say, track = torch.where(used, weight, 0.0), detections.track
     sums = group_sum(torch.stack((say * share, say), dim=1), track, int(track.max()) + 1)
     mean = sums[:, 0] / sums[:, 1].clamp_min(_LEAST)
     return _Errors((share - mean[track])[:, None], weight), usual
+
+
+def _precision(detections: CornerDetections, sigma: Float[Tensor, " m"]) -> Float[Tensor, "d 1"]:
+    """Of one corner of each detection [1 / px^2]."""
+    return 1 / detections.mean(sigma.square()[:, None])
 
 
 def _about_middle(

@@ -169,7 +169,7 @@ def _cost(summary: Mapping[str, TermSummary]) -> float:
 def _scales(bundle: Bundle) -> dict[str, float]:
     names = ("sign_px", "lane_px", "lane_correlation")
     scales = dict(zip(names, bundle.scale.tolist(), strict=True))
-    lasting = {"lasting_px": bundle.lasting, "lasting_size": bundle.lasting_size}
+    lasting = {"lasting_px": bundle.lasting[0], "lasting_size": bundle.lasting[1]}
     return {**scales, **{name: math.sqrt(float(variance)) for name, variance in lasting.items()}}
 
 

@@ -249,7 +249,7 @@ def test_signs_alone_and_lanes_alone_can_be_adjusted(street: Street):
 
 def test_outlines_that_tremble_for_a_while_are_worth_less(street: Street, adjusted: Adjusted):
     still = adjusted.bundle
-    assert float(still.lasting) < 0.1
+    assert float(still.lasting[0]) < 0.1
     journeys = tuple(
         trembling(journey, found.sign, seed)
         for seed, (journey, found) in enumerate(
@@ -260,7 +260,7 @@ def test_outlines_that_tremble_for_a_while_are_worth_less(street: Street, adjust
     adjust.adjust(bundle)
     # Shifts of one pixel that last for five frames: nine times that variance in the mean of many, some of which the
     # poses take for theirs.
-    assert 1.0 < float(bundle.lasting) < 9.0
+    assert 1.0 < float(bundle.lasting[0]) < 9.0
     # And the map says so, beside what all journeys share.
     a, b = (map_uncertainty(x, street.signs, street.lanes) for x in (still, bundle))
     own = [(x.center - x.shared).diagonal(dim1=1, dim2=2).sum(1) for x in (a, b)]

@@ -117,6 +117,9 @@ def views(true_share: float, seed: int = 0) -> Views:
         most=4,
         count=torch.full((count,), 4.0, dtype=F64),
         first=4 * torch.arange(count),
+        frame=seen[:, 0],
+        order=torch.arange(count),
+        track=torch.arange(count),
         follower=torch.full((count,), -1),
     )
     values = {"pose": given.clone(), "sign": sign, "size": size}

@@ -15,6 +15,7 @@ from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.adjustment.shared_corner_errors import (
     Lasting,
     corner_detections,
+    kept_in_tracks,
     lasting_errors,
     shared_errors,
 )
@@ -81,9 +82,9 @@ def test_what_lasts_is_the_variance_of_long_means(shift: float, lasts: float, se
     used = torch.ones(len(table) // _CORNERS, dtype=torch.bool)
     found = lasting(table, errors(shift, lasts, seed), used, shift**2)
     expected = shift**2 * (1 + lasts) / (1 - lasts)
-    assert abs(float(found.shift) - expected) < 0.25 * expected + 0.03
+    assert abs(float(found.of_many[0]) - expected) < 0.25 * expected + 0.03
     # A shift is no size, and what noise leaves of it is none.
-    assert float(found.size) == 0
+    assert float(found.of_many[1]) == 0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -97,8 +98,8 @@ def test_sizes_that_last_are_told_from_shifts_and_from_signs_that_are_larger(
     found = lasting(table, errors(0.0, lasts, seed, size) + larger, used, 0.0)
     # Beside the mean of sixty views more than half of what lasts for nine shows; of what does not last nothing does.
     expected = 0.57 * size**2 * (1 + lasts) / (1 - lasts) if lasts else 0.0
-    assert abs(float(found.size) - expected) <= 0.35 * expected
-    assert float(found.shift) < 0.03
+    assert abs(float(found.of_many[1]) - expected) <= 0.35 * expected
+    assert float(found.of_many[0]) < 0.03
     # Centres of boxes, which have no size, change nothing.
     centres = torch.arange(len(table)) % _CORNERS == 0
     more = replace(
@@ -108,7 +109,7 @@ def test_sizes_that_last_are_told_from_shifts_and_from_signs_that_are_larger(
     more = replace(more, detection=torch.cat((table.detection, alone)))
     error = errors(0.0, lasts, seed, size) + larger
     beside = lasting(more, torch.cat((error, error[centres])), used.repeat(2), 0.0)
-    torch.testing.assert_close(beside.size, found.size)
+    torch.testing.assert_close(beside.of_many[1], found.of_many[1])
 
 
 def test_outliers_and_what_is_given_up_do_not_matter():
@@ -119,9 +120,9 @@ def test_outliers_and_what_is_given_up_do_not_matter():
     for counted in (~wild, torch.ones_like(wild)):
         used = detections.have(counted)
         assert int(used.sum()) == int(counted.sum()) // _CORNERS
-        assert float(lasting(table, error, used, 0.0).shift) < 0.15
+        assert float(lasting(table, error, used, 0.0).of_many[0]) < 0.15
     none = lasting(table, error, used & False, 1.0)
-    assert not none.shift and not none.size
+    assert not none.of_many.any()
 
 
 def test_detections_of_other_signs_drives_and_kinds_do_not_follow_each_other():
@@ -132,6 +133,10 @@ def test_detections_of_other_signs_drives_and_kinds_do_not_follow_each_other():
     expected = torch.arange(count) + _SIGNS
     expected[torch.arange(count) // _SIGNS % _VIEWS == _VIEWS - 1] = -1
     assert (follower == expected).all()
+    has = follower >= 0
+    assert (first.track[follower[has]] == first.track[has]).all()
+    assert int(first.track.max()) + 1 == _SIGNS * _JOURNEYS
+    assert (first.order.diff()[first.track[first.order].diff() == 0] == _SIGNS).all()
     # The centres of boxes, of odd numbers, are detections beside those of their corners.
     both = replace(table, detection=table.detection + (torch.arange(len(table)) % 4 == 3))
     twice = corner_detections(both)
@@ -140,11 +145,20 @@ def test_detections_of_other_signs_drives_and_kinds_do_not_follow_each_other():
     assert (twice.follower[used] % 2 == torch.nonzero(used)[:, 0] % 2).all()
 
 
+def lasts(shift: float, size: float, *, of_each: float = 1.0) -> Lasting:
+    """What lasts of shifts and of sizes, and a share of it that each has alone."""
+    of_many = torch.tensor([shift, size], dtype=F64)
+    return Lasting(of_many, of_each * of_many)
+
+
 def test_what_lasts_takes_off_the_say_of_the_mean_and_of_the_size_alone():
     table = rows()
     sigma = torch.full((len(table),), 0.5, dtype=F64)
-    lasts = Lasting(torch.tensor(3.0, dtype=F64), torch.tensor(1e-4, dtype=F64))
-    shared = shared_errors(corner_detections(table), table.px, sigma, lasts)
+    detections = corner_detections(table)
+    every = torch.ones(len(detections.count), dtype=torch.bool)
+    # Nothing of it is there a frame later: all views have the same say.
+    shared = shared_errors(detections, table.px, sigma, lasts(3.0, 1e-4), every)
+    assert shared is not None
     shift = torch.ones(2, len(table), dtype=F64)
     expected = (1 + _CORNERS * 3.0 / 0.25) ** -0.5
     torch.testing.assert_close(shared.whiten(shift), expected * shift)
@@ -155,6 +169,61 @@ def test_what_lasts_takes_off_the_say_of_the_mean_and_of_the_size_alone():
     torch.testing.assert_close(shared.whiten(larger), expected * larger)
     wedge = larger.flip(0).contiguous() * torch.sign(larger)
     torch.testing.assert_close(shared.whiten(wedge), wedge)
+    # What does not last takes nothing off, and no time.
+    of_shifts = shared_errors(detections, table.px, sigma, lasts(3.0, 0.0), every)
+    assert of_shifts is not None
+    torch.testing.assert_close(of_shifts.whiten(shift), shared.whiten(shift))
+    torch.testing.assert_close(of_shifts.whiten(larger), larger)
+    assert shared_errors(detections, table.px, sigma, lasts(0.0, 0.0), every) is None
+
+
+def in_track(of_many: float, of_each: float, own: Tensor, frame: Tensor) -> Tensor:
+    """R^-1 1 as shares of what noise of variance `own` leaves, written out: views of one track at these frames."""
+    stays = (of_many - of_each) / (of_many + of_each)
+    apart = (frame[:, None] - frame).abs() / frame.diff().double().mean()
+    together = torch.diag(own) + of_each * stays**apart
+    return own * torch.linalg.solve(together, torch.ones_like(own))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("of_each", [0.5, 0.1])
+def test_each_view_counts_as_in_the_mean_of_its_track(of_each: float, seed: int):
+    g = torch.Generator().manual_seed(seed)
+    detections = corner_detections(rows())
+    own = 0.2 * (1 + 0.2 * torch.rand(len(detections.count), generator=g, dtype=F64))
+    counted = torch.rand(len(own), generator=g) < 0.7
+    precision = (1 / own)[:, None, None].expand(-1, 2, 2)
+    kept = kept_in_tracks(detections, precision, lasts(8.0, 2.0, of_each=of_each), counted)
+    for track in range(int(detections.track.max()) + 1):
+        at = torch.nonzero(counted & (detections.track == track))[:, 0]
+        for kind, of_many in enumerate((8.0, 2.0)):
+            expected = in_track(of_many, of_each * of_many, own[at], detections.frame[at])
+            alone = own[at] / (own[at] + of_each * of_many)
+            among_many = own[at] / (own[at] + of_many)
+            expected = torch.minimum(torch.maximum(expected, among_many / 2), alone)
+            torch.testing.assert_close(kept[at, 0, kind], expected)
+            torch.testing.assert_close(kept[at, 1, kind], expected)
+            # Nothing beyond the last view errs like it does.
+            assert float(kept[at[-1], 0, kind]) > 1.2 * float(kept[at[1:-1], 0, kind].median())
+
+
+def test_views_with_none_beside_them_count_by_what_each_has_wrong():
+    detections = corner_detections(rows())
+    count = len(detections.count)
+    precision = torch.full((count, 1, 2), 5.0, dtype=F64)
+    lasting_ones = lasts(8.0, 2.0, of_each=0.1)
+    # Views of a sign that are 40 frames apart, and one alone.
+    is_far = detections.frame % 40 == 0
+    expected = 1 / (1 + lasting_ones.of_each * 5.0)
+    for counted in (is_far, is_far & (detections.track == 3)):
+        kept = kept_in_tracks(detections, precision, lasting_ones, counted)
+        torch.testing.assert_close(kept[counted, 0], expected.expand(int(counted.sum()), 2))
+    none = kept_in_tracks(detections, precision, lasting_ones, counted & False)
+    torch.testing.assert_close(none[0, 0], 1 / (1 + lasting_ones.of_many * 5.0))
+    # Two views of one sign in one frame are as near as any.
+    twice = replace(detections, frame=detections.frame // 2)
+    kept = kept_in_tracks(twice, precision, lasting_ones, ~is_far)
+    assert bool(((kept > 0) & (kept <= expected + 1e-12)).all())
 
 
 def with_boxes(bundle: Bundle, share: float, seed: int) -> Bundle:
@@ -178,7 +247,7 @@ def with_boxes(bundle: Bundle, share: float, seed: int) -> Bundle:
     changed.see(replace(rows, **observed))
     changed.given_up = torch.zeros(int(number.max()) + 1, dtype=torch.bool)
     changed.lasting.zero_()
-    changed.lasting_size.zero_()
+    changed.lasting_each.zero_()
     # As if poses were known: each shift is its own innovation.
     known = torch.full((len(changed.innovation), 2), 1e-6, dtype=F64)
     square = changed.detections.mean(error).square().mean(1)
@@ -204,5 +273,5 @@ def test_loose_corners_of_boxes_do_not_hide_what_lasts(adjusted: Adjusted, share
         bundle.share_there.fill_(1.0)
         bundle.refresh(foreseen(bundle))
     # Five pushes of 0.4 px in each shift: 4 px^2 in the mean of many, less where centres follow each other with gaps.
-    assert 1.0 < float(tight.lasting) < 7.0
+    assert 1.0 < float(tight.lasting[0]) < 7.0
     torch.testing.assert_close(mixed.lasting, tight.lasting)
