@@ -291,11 +291,9 @@ class Bundle(BundleState):
         corners, *lanes = narrows.tolist()
         if corners or not foreseen or self.config.method == "paper2017":
             return not corners, not any(lanes)
-        of_many, of_each, share, rests = self.together.of_all(
-            self._seen_lasting, of_corners, self.innovation
-        )
-        self.lasting.copy_(of_many)
-        self.lasting_each.copy_(of_each)
+        now, share, rests = self.together.of_all(self._seen_lasting, of_corners, self.innovation)
+        self.lasting.copy_(now.of_many)
+        self.lasting_each.copy_(now.of_each)
         self.share_there.copy_(share)
         lasting_rests, share_rests = rests.tolist()
         return lasting_rests, share_rests and not any(lanes)
@@ -314,14 +312,14 @@ class Bundle(BundleState):
 
     def _seen_lasting(
         self, of_corners: Float[Tensor, "m 2"], innovation: Float[Tensor, "d 3"]
-    ) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"], Float[Tensor, ""], Bool[Tensor, " 2"]]:
+    ) -> tuple[Lasting, Float[Tensor, ""], Bool[Tensor, " 2"]]:
         """What lasts of shifts and of sizes by the errors of all, what share of poses' is there, and whether both rest.
 
         From the second time on shifts and that share go half of the way to where they are found, by what they were.
         """
         before = Lasting(self.lasting, self.lasting_each)
         if not len(of_corners):
-            return before.of_many, before.of_each, self.share_there, self.given_up.new_ones(2)
+            return before, self.share_there, self.given_up.new_ones(2)
         rows, detections = self.whole.corners, self.whole.detections
         # Corners of boxes tell little of it, and would hide that of outlines; the centre of a box counts.
         used = detections.have(~self.given_up[rows.detection] & (rows.loose_px == 0))
@@ -337,7 +335,7 @@ class Bundle(BundleState):
         now, rests = before.toward(found, far, noise.mean(), is_told)
         share_rests = (share - self.share_there).abs() <= _SHARE_RESTS
         share = torch.lerp(self.share_there, share, far)
-        return now.of_many, now.of_each, share, torch.stack((rests, share_rests))
+        return now, share, torch.stack((rests, share_rests))
 
     def problem(self) -> Problem:
         """The least-squares problem with the matches and scales of the moment, lanes held where they are.
@@ -410,11 +408,8 @@ class Bundle(BundleState):
             reprojection.sign_reprojection_jacobian,
         )
         if isinstance(sigma, Tensor):
-            lasting, counted = (
-                Lasting(self.lasting, self.lasting_each),
-                ~self.given_up[rows.detection],
-            )
-            how = rows.px, sigma, lasting, self.detections.have(counted)
+            lasting = Lasting(self.lasting, self.lasting_each)
+            how = rows.px, sigma, lasting, ~self.given_up[rows.detection]
             term = replace(term, shared=shared_errors(self.detections, *how))
         return {"sign_reprojection": self.fleet.of_corners(term, rows, self._by_optics[0])}
 

@@ -145,18 +145,21 @@ def shared_errors(
     px: Float[Tensor, "m 2"],
     sigma: Float[Tensor, " m"],
     lasting: Lasting,
-    counted: Bool[Tensor, " d"],
+    counted: Bool[Tensor, " m"],
 ) -> SharedErrors | None:
     """How corners at `px` with a noise of `sigma` [px] each weigh together where some of what they err by lasts.
 
-    None: nothing does. Detections that are `counted` alone have a say.
+    None: nothing does. Detections all of whose corners are `counted` alone have a say.
     """
     # One number from where they are.
     last = lasting.of_many > 0
     kinds = int(last[0] + 2 * last[1])
+    if not kinds:
+        return None
     shifts, sizes = bool(kinds & 1), bool(kinds & 2)
     patterns, known = [], []
-    of, count, precision = detections.run, detections.count[:, None], _precision(detections, sigma)
+    of, count = detections.run, detections.count[:, None]
+    precision = 1 / detections.mean(sigma.square()[:, None])
     if shifts:
         patterns.append(count.rsqrt()[of].expand(-1, 2))
         known.append((count * precision).expand(-1, 2))
@@ -165,11 +168,10 @@ def shared_errors(
         patterns.append(about * spread.clamp_min(_LEAST).rsqrt()[of])
         # Size counts in u and in v by itself, as if each erred on its own: together they then tell of it what one would.
         known.append(2 * spread * precision)
-    if not patterns:
-        return None
     of_kind = slice(0 if shifts else 1, 2 if sizes else 1)
     lasts = Lasting(lasting.of_many[of_kind], lasting.of_each[of_kind])
-    kept = kept_in_tracks(detections, torch.stack(known, dim=-1), lasts, counted)
+    say = detections.have(counted)
+    kept = kept_in_tracks(detections, torch.stack(known, dim=-1), lasts, say)
     return SharedErrors(
         of, detections.rank, detections.most, torch.stack(patterns, dim=-1), kept.sqrt()[of]
     )
@@ -306,11 +308,6 @@ def _size_errors(
     sums = group_sum(torch.stack((say * share, say), dim=1), track, int(track.max()) + 1)
     mean = sums[:, 0] / sums[:, 1].clamp_min(_LEAST)
     return _Errors((share - mean[track])[:, None], weight), usual
-
-
-def _precision(detections: CornerDetections, sigma: Float[Tensor, " m"]) -> Float[Tensor, "d 1"]:
-    """Of one corner of each detection [1 / px^2]."""
-    return 1 / detections.mean(sigma.square()[:, None])
 
 
 def _about_middle(

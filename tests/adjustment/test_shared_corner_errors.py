@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -155,7 +156,7 @@ def test_what_lasts_takes_off_the_say_of_the_mean_and_of_the_size_alone():
     table = rows()
     sigma = torch.full((len(table),), 0.5, dtype=F64)
     detections = corner_detections(table)
-    every = torch.ones(len(detections.count), dtype=torch.bool)
+    every = torch.ones(len(table), dtype=torch.bool)
     # Nothing of it is there a frame later: all views have the same say.
     shared = shared_errors(detections, table.px, sigma, lasts(3.0, 1e-4), every)
     assert shared is not None
@@ -205,6 +206,35 @@ def test_each_view_counts_as_in_the_mean_of_its_track(of_each: float, seed: int)
             torch.testing.assert_close(kept[at, 1, kind], expected)
             # Nothing beyond the last view errs like it does.
             assert float(kept[at[-1], 0, kind]) > 1.2 * float(kept[at[1:-1], 0, kind].median())
+
+
+def test_a_sign_is_placed_nearly_as_well_as_by_all_covariances():
+    detections = corner_detections(rows())
+    own, of_each, stays = 0.25, 0.49, math.exp(-1 / 4.5)
+    of_many = of_each * (1 + stays) / (1 - stays)
+    # Passed at 4 m, seen from 56 to 9 m ahead of it: where it is beside the road and along it.
+    ahead = 56 - 0.8 * torch.arange(_VIEWS, dtype=F64)
+    shows = 1000 * torch.stack((1 / ahead, -4 / ahead**2, 1 / ahead, -2 / ahead**2)).view(2, 2, -1)
+    beside, along = shows.unbind(1)
+    tells = torch.cat(
+        (torch.stack((beside[0], along[0])), torch.stack((0 * along[1], along[1]))), 1
+    )
+    apart = (torch.arange(_VIEWS)[:, None] - torch.arange(_VIEWS)).abs()
+    one = own * torch.eye(_VIEWS, dtype=F64) + of_each * stays**apart
+    covariance = torch.block_diag(one, one)
+    best = torch.linalg.inv(tells @ torch.linalg.solve(covariance, tells.T)).diagonal().sqrt()
+
+    def sigma(weight: Tensor) -> Tensor:
+        weighed = tells * weight.repeat(2)
+        gain = torch.linalg.solve(weighed @ tells.T, weighed)
+        return (gain @ covariance @ gain.T).diagonal().sqrt() / best
+
+    precision = torch.full((len(detections.count), 1, 1), 1 / own, dtype=F64)
+    lasting_one = Lasting(*torch.tensor([[of_many], [of_each]], dtype=F64))
+    kept = kept_in_tracks(detections, precision, lasting_one, detections.track >= 0)
+    of_track = kept[detections.order[:_VIEWS], 0, 0]
+    assert (sigma(of_track) < 1.05).all()
+    assert float(sigma(torch.ones_like(of_track))[1]) > 1.1
 
 
 def test_views_with_none_beside_them_count_by_what_each_has_wrong():
