@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -292,14 +293,8 @@ def build_bundle(
     config = config.resolved()
     pins = None if control is None else find_control_signs(first.signs, control, config.control)
     return adjust.build(
-        journeys,
-        [m.road for m in maps],
-        first.signs,
-        first.lanes,
-        first.associations,
-        first.drifts,
-        first.crowd.positioning,
-        config.adjust,
+        *(journeys, [m.road for m in maps], first.signs, first.lanes),
+        *(first.associations, first.drifts, first.crowd.positioning, config.adjust),
         lane_tracklets=[m.lane_tracklets for m in maps],
         lane_support=first.lane_support,
         trusted=first.crowd.trusted_frames(journeys),
@@ -322,17 +317,19 @@ def adjusted_map(
     progress: ProgressCall = silent,
 ) -> MapResult:
     """Section V-B: the `first` map adjusted, and once more where signs turned out to be one."""
+
+    def told(number: int, *_: object) -> None:
+        progress("bundle adjustment", number + 1, config.adjust.lm.max_iterations)
+
     while True:
         bundle = build_bundle(dataset.journeys, maps, first, config, control=control)
-        state = begun = adjust.start(bundle)
-        for iteration, after, _ in adjust.steps(bundle, begun, engine=engine):
-            state = after
-            progress("bundle adjustment", iteration + 1, config.adjust.lm.max_iterations)
-        again, known = made_anew(dataset.journeys, maps, first, bundle, config, engine)
+        ask = partial(made_anew, dataset.journeys, maps, first, bundle, config, engine)
+        begun = adjust.start(bundle)
+        state, (again, known) = adjust.adjust_until(bundle, begun, ask, told=told, engine=engine)
         if again is None:
             return finish_map(dataset, maps, first, bundle, state, config, engine, known)
         first = again
-        del bundle, begun, state
+        del ask, bundle, begun, state
 
 
 @one_core_each()
@@ -344,12 +341,13 @@ def made_anew(
     bundle: Bundle,
     config: MapperConfig,
     engine: Engine | None = None,
+    ended: bool = True,
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
     """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: nothing.
 
     None is what went astray, is another one from afar, or fits too few drives and is none of two that may be one. Markers
     that are there twice are joined anew, signs of single drives that are one come in while a round is left that can tell
-    whether they fit. With it the covariances, if they had to be known for that.
+    whether they fit. With it the covariances, if they had to be known for that: before it has `ended` that can wait.
     """
     rules = config.duplicate_signs
     if first.completed is None or first.anew >= rules.rounds:
@@ -365,7 +363,7 @@ def made_anew(
     given = journeys, poses, [m.sign_tracklets for m in maps]
     how = rules, config.complete_tracks, sound
     once = without_strayed(*given, found, first.signs, first.drifts, drifts, unseen, pair, *how)
-    if once is None and len(pair):
+    if once is None and len(pair) and ended:
         known = map_uncertainty(bundle, first.signs, first.lanes, engine)
         found = replace(found, heads=replace(signs, covariance=known.of_their_own))
         once = associated_once(*given, found, *how)

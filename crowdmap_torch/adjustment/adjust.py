@@ -9,9 +9,10 @@ all that the next ones follow from; a bundle that is built alike goes on from th
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,6 +26,7 @@ from crowdmap_torch.adjustment.convoys import Convoys
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.cuts import cut_drives
 from crowdmap_torch.adjustment.footing import Footing, stand_on
+from crowdmap_torch.adjustment.landmark_priors import fixed_terms, up_of_road
 from crowdmap_torch.adjustment.lane_matching import (
     LaneMatches,
     follow,
@@ -33,7 +35,6 @@ from crowdmap_torch.adjustment.lane_matching import (
 )
 from crowdmap_torch.adjustment.lenses import lenses_of
 from crowdmap_torch.adjustment.observations import (
-    CornerObservations,
     LanePointObservations,
     corner_observations,
     frame_offsets,
@@ -45,21 +46,26 @@ from crowdmap_torch.adjustment.residual_summary import TermSummary, residual_sum
 from crowdmap_torch.adjustment.steps import adjust_step, start
 from crowdmap_torch.crowd_lanes.table import LaneSupport
 from crowdmap_torch.fleet.engine import Engine
-from crowdmap_torch.geometry import plane, polygon, se3, spline_basis
+from crowdmap_torch.geometry import plane, se3, spline_basis
 from crowdmap_torch.geometry.trajectory import station
 from crowdmap_torch.noise.calibration import KnownCalibration
 from crowdmap_torch.noise.drift_nodes import DriftNodes, drift_nodes
 from crowdmap_torch.noise.pose_prior import MOST_NUMBERS, pose_prior
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.optim import levenberg_marquardt as lm
-from crowdmap_torch.optim.problem import CostTerm
 from crowdmap_torch.processes.at_rest import leave
 from crowdmap_torch.processes.memory import give_back
-from crowdmap_torch.residuals.lane import lane_prior, lane_stretch
-from crowdmap_torch.residuals.sign_prior import against_the_drive, habit_term, sign_place
+from crowdmap_torch.processes.progress import silent
 from crowdmap_torch.survey.control import ControlSigns
 from crowdmap_torch.tables import Association, Journey, Lanes, RoadEstimate, Signs, Tracklets
 
+Asked = TypeVar("Asked", bound=tuple[object, ...])
+AskCall = Callable[[bool], Asked]
+"""Is asked which landmarks there are, by an adjustment that has ended or not; says first what to begin with, or None."""
+Seen = Callable[[], dict[str, TermSummary]]
+"""Tells the residuals where a step has come to."""
+ToldCall = Callable[[int, lm.LmState, Seen], object]
+"""Is handed the number of a step, the state after it, and what tells the residuals there."""
 _SUPPORT_M = 3.0
 """How far along a lane tracklet a sample of it, which tells its lane, may be away: samples are 2 m apart."""
 _MARGIN = 1.3
@@ -133,8 +139,8 @@ def build(
     unknown = calibration or CalibrationConfig.off()
     fleet = fleet_of(journeys, frame, nodes.journey_of_pose, unknown, known_cars or {})
     values |= fleet.start
-    up = _up_of_road(observed, values["pose"], lane, lanes.control_count)
-    fixed = _fixed_terms(values, signs, lanes, up, observed.corners, control, config)
+    up = up_of_road(observed, values["pose"], lane, lanes.control_count)
+    fixed = fixed_terms(values, signs, lanes, up, observed.corners, control, config)
     priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet)
     bundle = Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
     if footing is not None:
@@ -185,7 +191,7 @@ def adjust(bundle: Bundle) -> lm.LmState:
 
 def steps(
     bundle: Bundle, state: lm.LmState, *, first: int = 0, engine: Engine | None = None
-) -> Generator[tuple[int, lm.LmState, Callable[[], dict[str, TermSummary]]], None, None]:
+) -> Generator[tuple[int, lm.LmState, Seen], None, None]:
     """Every step's number, from `first` on, and the state after it, until the adjustment is finished or out of steps.
 
     With each goes what tells the residuals there. Many drives are shared out to the hosts of an engine, in `convoys`, which
@@ -209,6 +215,40 @@ def steps(
             else:
                 state, _ = convoys.step()
             yield number, state, seen
+
+
+def adjust_until(
+    bundle: Bundle,
+    state: lm.LmState,
+    ask: AskCall[Asked],
+    *,
+    told: ToldCall = silent,
+    first: int = 0,
+    engine: Engine | None = None,
+) -> tuple[lm.LmState, Asked]:
+    """The state at the end of `steps`, or where landmarks turn out to be others, and what `ask` then said.
+
+    It is asked at the end, with True, and, unless the adjustment began where another one stood, one step after
+    detections were first judged: what is left to do moves landmarks by little, and is done once if they are others, of which
+    the first thing said is not None. `told` is handed what `steps` gives, step by step.
+    """
+    pauses = first > 0 and _pauses(bundle, state)
+    while True:
+        with closing(steps(bundle, state, first=first, engine=engine)) as taken:
+            while not pauses and (step := next(taken, None)):
+                told(*step)
+                first, state = step[0] + 1, step[1]
+                pauses = _pauses(bundle, state)
+        # Its equations have served: covariances begin where the adjustment stands.
+        state = replace(state, normal=None)
+        said = ask(not pauses)
+        if said[0] is not None or not pauses:
+            return state, said
+        pauses = False
+
+
+def _pauses(bundle: Bundle, state: lm.LmState) -> bool:
+    return not state.done and int(bundle.steps_judged) == 1
 
 
 @dataclass(frozen=True)
@@ -312,93 +352,6 @@ def _matched(
     found = lane >= 0
     points = points[found]
     return points, LaneMatches(lane[found], t[found], points.ideal, found[found])
-
-
-def _fixed_terms(
-    values: dict[str, Tensor],
-    signs: Signs,
-    lanes: Lanes,
-    up: Float[Tensor, "c 3"],
-    corners: CornerObservations,
-    control: ControlSigns | None,
-    config: AdjustConfig,
-) -> dict[str, CostTerm]:
-    """What is known of signs and lanes before anything is seen of them."""
-    fixed = _lane_prior(values["lane"], lanes, up, config)
-    if len(corners):
-        facing = against_the_drive(values["pose"][corners.frame], corners.sign, len(signs))
-        # Signs that nobody sees stay as they are.
-        own = corners.sign.unique()
-        fixed["sign_habit"] = habit_term(facing[own], own, config.habit)
-    if control is not None and len(control):
-        fixed["control"] = _control_term(control, signs)
-    return fixed
-
-
-def _control_term(control: ControlSigns, signs: Signs) -> CostTerm:
-    """Surveyed centres of signs; a sign's centre is the mean of its corners."""
-    shape = signs.shape[control.sign]
-    mask = polygon.corner_mask(shape)[..., None].to(control.center_world)
-    template = (polygon.template(shape).to(mask) * mask).sum(1) / mask.sum(1)
-    return CostTerm(
-        sign_place,
-        (("sign", control.sign), ("size", control.sign)),
-        (template, control.center_world),
-        1 / control.sigma,
-        takes_rows=True,
-    )
-
-
-def _up_of_road(
-    observed: Observations,
-    T_world_camera: Float[Tensor, "p 4 4"],
-    coefficient: Float[Tensor, "c 3"],
-    count: Int[Tensor, " n"],
-) -> Float[Tensor, "c 3"]:
-    """Up from the road at each lane coefficient, in the mean of all who saw it; upwards where nobody did."""
-    points = observed.lane_points
-    of_frame = T_world_camera[points.frame, :3, :3]
-    normal = -(of_frame @ points.normal_camera[..., None])[..., 0]
-    beside, weight = observed.matches.windows(count)
-    up = torch.zeros_like(coefficient)
-    up[:, 2] = 1e-6
-    for row, share in zip(beside.unbind(1), weight.unbind(1), strict=True):
-        up.index_add_(0, row, share.abs()[:, None] * normal)
-    return torch.nn.functional.normalize(up, dim=-1)
-
-
-def _lane_prior(
-    coefficient: Float[Tensor, "c 3"], lanes: Lanes, up: Float[Tensor, "c 3"], config: AdjustConfig
-) -> dict[str, CostTerm]:
-    """What holds control points together where observations do not; `up` is away from the road at each.
-
-    Not where they started: that would count the journeys' own positions twice.
-    """
-    if not len(lanes):
-        return {}
-    spline, rank = spline_basis.rows(lanes.control_count)
-    along = spline_basis.derivative_flat(
-        lanes.control.point_world, lanes.control_count, rank.to(coefficient), spline
-    )
-    forward = torch.nn.functional.normalize(along, dim=-1)
-    left = torch.nn.functional.normalize(torch.linalg.cross(up, forward), dim=-1)
-    axes = torch.stack((forward, left, torch.linalg.cross(forward, left)), dim=-1)
-    place = CostTerm(
-        lane_prior,
-        (("lane", torch.arange(len(coefficient), device=coefficient.device)),),
-        (coefficient.clone(), axes),
-        coefficient.new_full((len(coefficient),), 1 / config.lane_place_sigma_m),
-        takes_rows=True,
-    )
-    first = torch.nonzero(spline[1:] == spline[:-1])[:, 0]
-    step = CostTerm(
-        lane_stretch,
-        (("lane", first), ("lane", first + 1)),
-        (coefficient[first + 1] - coefficient[first], axes[first]),
-        (1 / coefficient.new_tensor(config.lane_step_sigma_m)).expand(len(first), 3).contiguous(),
-        takes_rows=True,
-    )
-    return {"lane_prior": place, "lane_stretch": step}
 
 
 @torch.no_grad()

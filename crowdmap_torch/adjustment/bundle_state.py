@@ -56,6 +56,8 @@ class BundleState(nn.Module):
     """The same of single ones."""
     judged: Tensor
     """How often detections were judged by everything else."""
+    steps_judged: Tensor
+    """How many steps were taken since."""
     given_up: Tensor
     """Detections, by number, that have no say."""
     prior_scale: Tensor
@@ -114,6 +116,7 @@ class BundleState(nn.Module):
         given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
         self.register_buffer("given_up", given_up)
         self.register_buffer("judged", torch.zeros_like(given_up, dtype=torch.long).sum())
+        self.register_buffer("steps_judged", torch.zeros_like(self.judged))
         self.register_buffer(
             "prior_scale", values["bias"].new_ones(len(values["bias"]), priors.poses.scale_count)
         )

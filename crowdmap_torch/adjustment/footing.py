@@ -84,6 +84,7 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
             there = there[:, : here.shape[1]]
         here.copy_(there)
     bundle.judged.fill_(footing.judged)
+    bundle.steps_judged.fill_(footing.judged)
     both = min(len(bundle.given_up), len(footing.given_up))
     bundle.given_up[:both] = footing.given_up[:both]
     bundle.fold(values)

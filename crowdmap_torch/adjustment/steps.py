@@ -40,7 +40,8 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     that they are judged by first come to rest, and when the solver stops. It is finished when that changes nothing, or no
     more than is lost in how little is known.
     """
-    problem = bundle.problem()
+    problem, first = bundle.problem(), int(bundle.judged) == 0
+    bundle.steps_judged += not first
     normal = state.normal
     if not isinstance(normal, MapEquations):
         normal = backend.assemble(problem, state.values)
@@ -57,7 +58,7 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     del corners
     of_border = normal.border_information() if bundle.fleet.kinds else None
     bundle.fold(dict(state.values))
-    found, first = bundle.refresh(evidence, of_border), int(bundle.judged) == 0
+    found = bundle.refresh(evidence, of_border)
     # Scales that no longer move anything are at rest, however much they still change: little is known of them.
     # One short step does not tell: it may be the last before other detections count.
     moves = torch.maximum(state.in_sigmas_before, state.in_sigmas_left)

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypedDict
 
@@ -36,7 +36,6 @@ from crowdmap_torch.evaluation.evaluate import Against, against, control_ids_of
 from crowdmap_torch.evaluation.map_figures import MapFigures
 from crowdmap_torch.evaluation.text import format_figures
 from crowdmap_torch.fleet.choice import ENGINES
-from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.io.area import Area, Cut, cut_dataset, cut_truth, read_area
 from crowdmap_torch.io.budget import reading
 from crowdmap_torch.io.datasets import NoJourneyLeft, load_dataset
@@ -231,12 +230,13 @@ def _map(
             if found.start is None and not last.anew:
                 kept.keep_start(watch.start(bundle, mapper.clusters_map(dataset, first)))
             watch.follow(last.signs, last.lanes, bundle if last.anew and step is None else None)
-            state, by = _adjusted(bundle, begun, step, last.anew, kept, watch, where, progress)
-            again, uncertainty = mapper.made_anew(journeys, maps, last, bundle, config, by)
+            by, how = where.of_convoys(bundle), _how(bundle, step, last.anew, kept, watch, progress)
+            ask = partial(mapper.made_anew, journeys, maps, last, bundle, config, by)
+            state, (again, uncertainty) = adjust.adjust_until(bundle, begun, ask, engine=by, **how)
             if again is None:
                 break
             last, step = kept.keep_anew(again, watch.course), None
-            del bundle, begun, state  # As large as the next ones.
+            del ask, how, bundle, begun, state  # As large as the next ones.
 
         # ---- the map ----
         progress("covariances and map")
@@ -269,25 +269,23 @@ def _map(
     return EMPTY_MAP if options.strict and missing else 0
 
 
-def _adjusted(
-    bundle: Bundle,
-    begun: LmState,
-    step: Step | None,
-    anew: int,
-    kept: Checkpoint,
-    watch: Watch,
-    where: Whereabouts,
-    progress: Progress,
-) -> tuple[LmState, Engine | None]:
-    """The state when an adjustment is finished, every step watched and kept, and the engine of its convoys."""
-    state, by, most = begun, where.of_convoys(bundle), bundle.config.lm.max_iterations
-    taken = 0 if step is None else step.standing.steps
-    for iteration, state, seen in adjust.steps(bundle, begun, first=taken, engine=by):
+class _How(TypedDict):
+    told: adjust.ToldCall
+    first: int
+
+
+def _how(
+    bundle: Bundle, step: Step | None, anew: int, kept: Checkpoint, watch: Watch, progress: Progress
+) -> _How:
+    """From which step on an adjustment is to be taken, and what watches and keeps every step."""
+
+    def told(number: int, state: LmState, seen: adjust.Seen) -> None:
         watch.step(len(watch.iterations), state, bundle, seen())
-        kept.keep_step(adjust.standing(bundle, state, iteration + 1), watch.course, anew)
-        progress("bundle adjustment", iteration + 1, most, f"cost {float(state.cost):.1f}")
-    # Its equations have served: covariances begin where the adjustment ended.
-    return replace(state, normal=None), by
+        kept.keep_step(adjust.standing(bundle, state, number + 1), watch.course, anew)
+        most = bundle.config.lm.max_iterations
+        progress("bundle adjustment", number + 1, most, f"cost {float(state.cost):.1f}")
+
+    return {"told": told, "first": 0 if step is None else step.standing.steps}
 
 
 @contextmanager
