@@ -270,6 +270,7 @@ class Bundle(BundleState):
         first, changed = int(self.judged) == 0, not torch.equal(given_up, self.given_up)
         self.judged += 1
         self.given_up.copy_(given_up)
+        self.unjudged.fill_(False)
         return first or changed
 
     def _narrow(self, values: dict[str, Tensor], foreseen: bool) -> tuple[bool, bool]:
@@ -322,7 +323,9 @@ class Bundle(BundleState):
             return before, self.share_there, self.given_up.new_ones(2)
         rows, detections = self.whole.corners, self.whole.detections
         # Corners of boxes tell little of it, and would hide that of outlines; the centre of a box counts.
-        used = detections.have(~self.given_up[rows.detection] & (rows.loose_px == 0))
+        # Among those that came since detections were judged are some that show something else.
+        out = (self.given_up | self.unjudged)[rows.detection]
+        used = detections.have(~out & (rows.loose_px == 0))
         noise = detections.mean(self._sigma_of(rows).square()[:, None])[:, 0] / detections.count
         of_each, share = told_apart(innovation, noise, used)
         # Errors that are larger than they are taken to be are so until the scales have found them.

@@ -60,6 +60,8 @@ class BundleState(nn.Module):
     """How many steps were taken since."""
     given_up: Tensor
     """Detections, by number, that have no say."""
+    unjudged: Tensor
+    """Detections, by number, that came after all others had been judged."""
     prior_scale: Tensor
     """By journey, how far bias, drift, rotation and the bias's wander, if any, are from the sigmas of `prior`."""
     white_scale: Tensor
@@ -115,6 +117,7 @@ class BundleState(nn.Module):
         last = last if shared_out is None else shared_out.detections
         given_up = torch.zeros(last, dtype=torch.bool, device=self.scale.device)
         self.register_buffer("given_up", given_up)
+        self.register_buffer("unjudged", torch.zeros_like(given_up))
         self.register_buffer("judged", torch.zeros_like(given_up, dtype=torch.long).sum())
         self.register_buffer("steps_judged", torch.zeros_like(self.judged))
         self.register_buffer(

@@ -40,6 +40,8 @@ class Footing:
     """Whether detections were judged by everything else."""
     given_up: Bool[Tensor, " d"]
     """Detections, by number, that had no say then."""
+    seen: Bool[Tensor, " d"]
+    """Those that there were."""
 
 
 @torch.no_grad()
@@ -54,7 +56,15 @@ def footing_of(bundle: Bundle) -> Footing:
         {name: getattr(bundle, name).clone() for name in _SCALES},
         int(bundle.judged) > 0,
         bundle.given_up.clone(),
+        _seen(bundle),
     )
+
+
+def _seen(bundle: Bundle) -> Bool[Tensor, " d"]:
+    """The detections of corners that a bundle has, by number."""
+    seen = torch.zeros_like(bundle.given_up)
+    seen[bundle.corners.detection] = True
+    return seen
 
 
 @torch.no_grad()
@@ -63,7 +73,8 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
 
     A stretch of drift that was none before has that of the one before it in its journey, or of the one behind it. Where
     biases turned out to wander in one of both alone, what is known of all others holds. Detections that had no say have
-    none until they are judged once more. Lenses follow as the adjustment starts.
+    none until they are judged once more; until then those that were not there tell nothing of what lasts. Lenses follow as
+    the adjustment starts.
     """
     values, nodes = bundle.values(), bundle.prior.nodes
     values |= footing.steady
@@ -87,4 +98,8 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
     bundle.steps_judged.fill_(footing.judged)
     both = min(len(bundle.given_up), len(footing.given_up))
     bundle.given_up[:both] = footing.given_up[:both]
+    if footing.judged:
+        new = _seen(bundle)
+        new[:both] &= ~footing.seen[:both]
+        bundle.unjudged.copy_(new)
     bundle.fold(values)

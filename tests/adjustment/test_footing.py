@@ -59,6 +59,33 @@ def test_it_stands_where_the_other_one_ended(tiny, tiny_result: MapResult, ended
     assert int(again.judged) == 1 and torch.equal(again.given_up, ended.given_up)
 
 
+def test_detections_that_are_new_tell_nothing_of_what_lasts_until_they_are_judged(
+    tiny, tiny_result: MapResult, ended: Bundle
+):
+    first, footing = anew(tiny, tiny_result.first, ended), footing_of(ended)
+    assert not built(tiny, tiny_result, first).unjudged.any()
+    # As if nobody had seen the first sign before, and its outlines trembled by many pixels for a while.
+    of_first = ended.corners.detection[ended.corners.sign == 0]
+    seen = footing.seen.clone()
+    seen[of_first] = False
+    new = built(tiny, tiny_result, replace(first, footing=replace(footing, seen=seen)))
+    assert torch.equal(torch.nonzero(new.unjudged)[:, 0], of_first.unique())
+    told = []
+    for bundle, there in ((ended, True), (new, True), (new, False)):
+        rows, innovation = bundle.corners, torch.zeros_like(ended.innovation)
+        error = torch.zeros_like(rows.px)
+        if there:
+            error[rows.sign == 0] = 20.0
+            innovation[bundle.detections.mean((rows.sign == 0).double()[:, None])[:, 0] == 1] = (
+                innovation.new_tensor([400.0, 1.0, 0.0])
+            )
+        lasting, share, _ = bundle._seen_lasting(error, innovation)
+        told.append((float(lasting.of_many[0]), float(share)))
+    assert told[0][0] > 1.0 and told[1] == told[2]
+    new.judge(new.backend().assemble(new.problem(), new.values()))
+    assert not new.unjudged.any()
+
+
 def test_scales_of_poses_are_not_found_anew_where_nothing_was_told_yet(
     tiny, tiny_result: MapResult, ended: Bundle
 ):
