@@ -27,7 +27,7 @@ from crowdmap_torch.noise.pose_prior import CUT_TERMS, WANDER_SCALE
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import first_blocks
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
-from crowdmap_torch.optim.problem import CostTerm, Problem
+from crowdmap_torch.optim.problem import CostTerm, Problem, Values
 from crowdmap_torch.optim.robust import JointTukey, Tukey
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.elimination import planned_ahead
@@ -60,6 +60,8 @@ _TOLD_HOLDS = 0.02
 """What observations tell of poses' errors is found anew where any scale has changed by more than this share since."""
 _WHITE_RESTS = 0.03
 """A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
+_FEW = 0.1
+"""Detections are first judged when the scales of all but this share of the drives are at rest; once more when all are."""
 _SHARE_RESTS = 0.2
 """The share of poses' errors that is there is at rest where it changes by less than this: by as much of a small pull."""
 
@@ -81,7 +83,8 @@ class AtRest:
     scales: bool
     """All of them."""
     judging: bool
-    """Those that detections are judged by: of the noise of corners, of the poses' prior and of their noise."""
+    """Those that detections are judged by: of the noise of corners and, of most drives, of the poses' prior and noise; but
+    for the wander of biases, by which a sign's views are off alike."""
 
 
 class Bundle(BundleState):
@@ -173,8 +176,9 @@ class Bundle(BundleState):
             self.held_off.copy_(evidence.held_off)
             self.innovation.copy_(evidence.innovation)
         judging, at_rest = self._narrow(values, foreseen)
+        creeps = [torch.zeros_like(self.prior_scale[:, :1])]
         if evidence is not None:
-            judging &= self._rescale_noise(values, evidence)
+            creeps.append(self._rescale_noise(values, evidence))
         if of_border is not None:
             scaled = self.fleet, values, of_border, self.calibration_scales
             of_cars = self.together.of_all(lambda: rescaled_calibrations(*scaled))
@@ -186,11 +190,13 @@ class Bundle(BundleState):
             lambda drift: self.whole.prior.rescaled(drift, self.prior_scale, self.drift_told),
             values["drift"],
         )
-        rests = torch.full_like(found, _SCALE_RESTS)
-        rests[:, WANDER_SCALE:] = _WANDER_RESTS
-        judging &= self._follow("prior_scale", found, _SCALE_STAYS, rests)
+        moved = self._move("prior_scale", found) / _SCALE_RESTS
+        moved[:, WANDER_SCALE:] *= _SCALE_RESTS / _WANDER_RESTS
+        creeps.append(moved[:, :WANDER_SCALE])
+        few = (torch.cat(creeps, dim=1) > 1).any(1).double().mean()
+        few, wanders = torch.stack((few, (moved > 1).any().to(few))).tolist()
         self.refreshed.fill_(True)
-        return AtRest(at_rest and judging, judging)
+        return AtRest(at_rest and judging and few + wanders == 0, judging and few <= _FEW)
 
     def evidence(self) -> Evidence | None:
         """What was found last, as long as the scales are what it was found by; None: it is to be found anew."""
@@ -228,20 +234,16 @@ class Bundle(BundleState):
         told[mine] = own[mine]
         return self.together.sum(told)
 
-    def _rescale_noise(self, values: dict[str, Tensor], evidence: PoseEvidence) -> bool:
-        """Finds the noise of poses from frame to frame; returns whether it has come to rest."""
+    def _rescale_noise(self, values: Values, evidence: PoseEvidence) -> Float[Tensor, "j 6"]:
+        """Finds the noise of poses from frame to frame; the logarithms of what it changes by, where it rests below one."""
         scales = self.prior_scale, self.white_scale
         term = self._white_term()
         residual = whitened_residuals(term, values) if len(term) else self.poses_left
         found = self._of_journeys(white_scales(self.prior, residual, evidence.left, *scales))
-        return self._follow("white_scale", found, _WHITE_RESTS, _WHITE_RESTS)
-
-    def _follow(self, name: str, found: Tensor, stays: float, rests: float | Tensor) -> bool:
-        """Puts scales where they are `found`, to the last digit that counts; returns whether they are at rest."""
-        return not bool((self._move(name, found, stays) > rests).any())
+        return self._move("white_scale", found, _WHITE_RESTS) / _WHITE_RESTS
 
     def _move(self, name: str, found: Tensor, stays: float = _SCALE_STAYS) -> Tensor:
-        """Likewise; the logarithms of what they change by."""
+        """Puts scales where they are `found`, to the last digit that counts; the logarithms of what they change by."""
         scale = getattr(self, name)
         moved = (found / scale).log().abs()
         scale.copy_(torch.where(moved > stays, found, scale))

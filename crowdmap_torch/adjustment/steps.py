@@ -13,6 +13,9 @@ from crowdmap_torch.optim.solvers.normal_equations import MapBackend, MapEquatio
 from crowdmap_torch.processes.memory import give_back
 from crowdmap_torch.processes.threads import one_core_each
 
+_NEAR = 2.0
+"""Scales move nothing where all steps to come take landmarks no further than the last one may, by this factor."""
+
 
 @one_core_each()
 @torch.no_grad()
@@ -62,7 +65,7 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     # Scales that no longer move anything are at rest, however much they still change: little is known of them.
     # One short step does not tell: it may be the last before other detections count.
     moves = torch.maximum(state.in_sigmas_before, state.in_sigmas_left)
-    settled = state.done and bool((moves < bundle.config.lm.move_tolerance).all())
+    settled = state.done and bool((moves < _NEAR * bundle.config.lm.move_tolerance).all())
     at_rest = found.scales or settled
     if (found.judging or settled if first else at_rest and state.done) and bundle.judge(normal):
         if state.done:
