@@ -81,13 +81,14 @@ def convoys(
     """The first drive of every convoy and the one behind its last; one convoy where the way is not worth two.
 
     Drives are `journeys` one behind the other, with nodes of which each has the `way` driven to it. A convoy drives so
-    much or more, but for what drives are longer than others.
+    much or more, but for what drives are longer than others. They are an even number: all wait for the host that has most.
     """
     driven = way.new_zeros(journeys).scatter_reduce(0, journey, way, "amax")
     total = float(driven.sum())
     count = min(int(total / at_least_m), journeys) if at_least_m else 1
     if count < 2:
         return [(0, journeys)]
+    count -= count % 2
     of = ((running_sum(driven) - driven / 2) / total * count).long().clamp_max(count - 1)
     first = [0, *(torch.nonzero(of.diff())[:, 0] + 1).tolist(), journeys]
     return list(pairwise(first))

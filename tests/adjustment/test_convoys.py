@@ -218,3 +218,6 @@ def test_convoys_drive_about_as_much_each():
     assert convoys(journey, way, 6, 0.0) == [(0, 6)]
     # Where none may be parted, each is one.
     assert convoys(journey, way, 6, 1.0) == [(n, n + 1) for n in range(6)]
+    # Two hosts have as many each, where three convoys would be long enough, or five.
+    assert convoys(journey, way, 6, 18.0) == [(0, 3), (3, 6)]
+    assert len(convoys(journey, way, 6, 12.0)) == 4
