@@ -44,6 +44,8 @@ _PIXEL_DIM = 2
 """Numbers of a corner's residual: u and v."""
 _FIRST_REACH = 2.0
 """Factor by which the bound on a detection's error is wider until detections are judged: a wrong start gives up few."""
+_NEW_REACH = 10.0
+"""Likewise for detections of signs that come as an adjustment begins again: no pose knows of them, and noise is narrow."""
 _MOST_JUDGEMENTS = 2
 """Detections are judged no more often than this, should some of them come and go."""
 _NARROWS = 0.97
@@ -270,7 +272,7 @@ class Bundle(BundleState):
                 given_up[self.corners.detection] = too_large[term.loss.run]
             given_up = self.together.sum(given_up.long()) > 0
         first, changed = int(self.judged) == 0, not torch.equal(given_up, self.given_up)
-        self.judged += 1
+        self.judged += ~self.unjudged.any()
         self.given_up.copy_(given_up)
         self.unjudged.fill_(False)
         return first or changed
@@ -424,6 +426,7 @@ class Bundle(BundleState):
         reach = _FIRST_REACH if int(self.judged) == 0 else 1.0
         bound = self.scale.new_tensor(self.config.tukey_c * reach)
         loss = JointTukey.by_efficiency(detection, bound, row_dim=_PIXEL_DIM)
+        loss = loss.wider(torch.where(self.unjudged[detection], _NEW_REACH, 1.0).to(bound))
         return loss.without(self.given_up[detection])
 
     def _hold_off_term(self) -> dict[str, CostTerm]:

@@ -55,7 +55,7 @@ class BundleState(nn.Module):
     lasting_each: Tensor
     """The same of single ones."""
     judged: Tensor
-    """How often detections were judged by everything else."""
+    """How often detections were judged by everything else, with none among them that was new."""
     steps_judged: Tensor
     """How many steps were taken since."""
     given_up: Tensor
@@ -252,7 +252,8 @@ class BundleState(nn.Module):
         """All scales that weigh observations and the prior, and how often detections were judged."""
         corner = (self.scale[0].square() + self.lasting[0]).sqrt()
         size = _SIZE_FELT + self.lasting[1].sqrt()
-        of_pixels = (self.scale[1:], corner[None], size[None], 1.0 + self.judged[None])
+        judged = 1.0 + self.judged - 0.5 * self.unjudged.any()
+        of_pixels = (self.scale[1:], corner[None], size[None], judged[None])
         return torch.cat((self.prior_scale.flatten(), self.white_scale.flatten(), *of_pixels))
 
 

@@ -40,8 +40,8 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     """One step of the solver, folded into the bundle, and whether the adjustment is finished.
 
     Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
-    that they are judged by first come to rest, and when the solver stops. It is finished when that changes nothing, or no
-    more than is lost in how little is known.
+    that they are judged by first come to rest, or do so with new ones, and when the solver stops. It is finished when that
+    changes nothing, or no more than is lost in how little is known.
     """
     problem, first = bundle.problem(), int(bundle.judged) == 0
     bundle.steps_judged += not first
@@ -67,7 +67,8 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     moves = torch.maximum(state.in_sigmas_before, state.in_sigmas_left)
     settled = state.done and bool((moves < _NEAR * bundle.config.lm.move_tolerance).all())
     at_rest = found.scales or settled
-    if (found.judging or settled if first else at_rest and state.done) and bundle.judge(normal):
+    soon = first or bool(bundle.unjudged.any())
+    if (found.judging or settled if soon else at_rest and state.done) and bundle.judge(normal):
         if state.done:
             state = lm.settled(bundle.problem(), state, normal, bundle.config.lm)
         at_rest &= state.done

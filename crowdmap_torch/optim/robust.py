@@ -151,6 +151,10 @@ class JointTukey:
         """The loss to which the rows of some detections are of no account."""
         return replace(self, gain=self.gain * ~given_up)
 
+    def wider(self, factor: Float[Tensor, " m"]) -> JointTukey:
+        """The loss with the bounds of each row's detection so much further out."""
+        return replace(self, c=self.c * factor)
+
     def rho(self, s: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
         """The loss of each row's detection, an equal share for every row of it."""
         return self.gain * self.share * Tukey(self.c).rho(self._together(s))

@@ -9,8 +9,9 @@ import torch
 from worlds.split_landmarks import with_a_split_sign, with_split_lanes
 
 from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.adjustment.bundle import Bundle
-from crowdmap_torch.adjustment.footing import footing_of
+from crowdmap_torch.adjustment import bundle as bundle_module
+from crowdmap_torch.adjustment.bundle import _NEW_REACH, Bundle
+from crowdmap_torch.adjustment.footing import Footing, footing_of
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.crowd_lanes.joined_anew import share_twice
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig
@@ -59,31 +60,56 @@ def test_it_stands_where_the_other_one_ended(tiny, tiny_result: MapResult, ended
     assert int(again.judged) == 1 and torch.equal(again.given_up, ended.given_up)
 
 
+def without_first(ended: Bundle) -> Footing:
+    """As if nobody had seen the first sign before."""
+    footing = footing_of(ended)
+    seen = footing.seen.clone()
+    seen[ended.corners.detection[ended.corners.sign == 0]] = False
+    return replace(footing, seen=seen)
+
+
 def test_detections_that_are_new_tell_nothing_of_what_lasts_until_they_are_judged(
     tiny, tiny_result: MapResult, ended: Bundle
 ):
-    first, footing = anew(tiny, tiny_result.first, ended), footing_of(ended)
+    first = anew(tiny, tiny_result.first, ended)
     assert not built(tiny, tiny_result, first).unjudged.any()
-    # As if nobody had seen the first sign before, and its outlines trembled by many pixels for a while.
-    of_first = ended.corners.detection[ended.corners.sign == 0]
-    seen = footing.seen.clone()
-    seen[of_first] = False
-    new = built(tiny, tiny_result, replace(first, footing=replace(footing, seen=seen)))
-    assert torch.equal(torch.nonzero(new.unjudged)[:, 0], of_first.unique())
+    new = built(tiny, tiny_result, replace(first, footing=without_first(ended)))
+    of_first = ended.corners.detection[ended.corners.sign == 0].unique()
+    assert torch.equal(torch.nonzero(new.unjudged)[:, 0], of_first)
+    # Outlines of that sign tremble by many pixels for a while, or do not.
     told = []
     for bundle, there in ((ended, True), (new, True), (new, False)):
         rows, innovation = bundle.corners, torch.zeros_like(ended.innovation)
         error = torch.zeros_like(rows.px)
         if there:
             error[rows.sign == 0] = 20.0
-            innovation[bundle.detections.mean((rows.sign == 0).double()[:, None])[:, 0] == 1] = (
-                innovation.new_tensor([400.0, 1.0, 0.0])
-            )
+            of_sign = bundle.detections.mean((rows.sign == 0).double()[:, None])[:, 0] == 1
+            innovation[of_sign] = innovation.new_tensor([400.0, 1.0, 0.0])
         lasting, share, _ = bundle._seen_lasting(error, innovation)
         told.append((float(lasting.of_many[0]), float(share)))
     assert told[0][0] > 1.0 and told[1] == told[2]
+    # That is no judgement of the others, but what poses tell is asked anew.
+    before = new.scales()
     new.judge(new.backend().assemble(new.problem(), new.values()))
-    assert not new.unjudged.any()
+    assert int(new.judged) == 1 and not new.unjudged.any()
+    assert not torch.equal(new.scales(), before)
+
+
+@pytest.mark.parametrize("reach", [_NEW_REACH, 1.0], ids=["new ones have a say", "they have none"])
+def test_a_sign_that_is_new_goes_where_it_is_seen_though_noise_is_known_to_be_small(
+    tiny, tiny_result: MapResult, ended: Bundle, monkeypatch: pytest.MonkeyPatch, reach: float
+):
+    monkeypatch.setattr(bundle_module, "_NEW_REACH", reach)
+    first = anew(tiny, tiny_result.first, ended)
+    T = first.signs.T_world_sign.clone()
+    T[0, 2, 3] += 0.25
+    signs = replace(first.signs, T_world_sign=T)
+    new = built(tiny, tiny_result, replace(first, signs=signs, footing=without_first(ended)))
+    adjust.adjust(new)
+    off = (new.values()["sign"] - ended.values()["sign"]).detach()[0, :3, 3].norm()
+    of_first = ended.corners.detection[ended.corners.sign == 0].unique()
+    lost = new.given_up[of_first].double().mean()
+    assert (float(off) < 0.05, float(lost) < 0.2) == ((True, True) if reach > 1 else (False, False))
 
 
 def test_scales_of_poses_are_not_found_anew_where_nothing_was_told_yet(

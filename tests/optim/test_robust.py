@@ -147,3 +147,14 @@ def test_a_median_along_an_axis_is_torchs(count: int, dim: int):
     assert torch.equal(median_along(value, dim), value.median(dim).values)
     value[0, 0] = torch.nan
     assert torch.equal(median_along(value, dim).isnan(), value.median(dim).values.isnan())
+
+
+def test_bounds_that_are_wider_let_a_detection_err_so_much_more():
+    label = torch.tensor([0, 0, 1, 1])
+    loss = JointTukey.by_efficiency(label, BOUND, row_dim=ROW_DIM)
+    wider = loss.wider(torch.tensor([3.0, 3.0, 1.0, 1.0], dtype=torch.float64))
+    s = torch.tensor([1.0, 2.0, 1.0, 2.0], dtype=torch.float64)
+    assert torch.equal(wider.weight(9 * s)[:2], loss.weight(s)[:2])
+    assert torch.equal(wider.weight(s)[2:], loss.weight(s)[2:])
+    # Beside whole others it is the same of a detection's own rows.
+    assert torch.equal(wider.of_rows(slice(0, 2)).weight(9 * s[:2]), loss.weight(s)[:2])
