@@ -195,10 +195,10 @@ class Bundle(BundleState):
         moved = self._move("prior_scale", found) / _SCALE_RESTS
         moved[:, WANDER_SCALE:] *= _SCALE_RESTS / _WANDER_RESTS
         creeps.append(moved[:, :WANDER_SCALE])
-        few = (torch.cat(creeps, dim=1) > 1).any(1).double().mean()
-        few, wanders = torch.stack((few, (moved > 1).any().to(few))).tolist()
+        creep = (torch.cat(creeps, dim=1) > 1).any(1).double().mean()
+        few = float(creep + 1e-9 * (moved > 1).any())  # One number from where they are.
         self.refreshed.fill_(True)
-        return AtRest(at_rest and judging and few + wanders == 0, judging and few <= _FEW)
+        return AtRest(at_rest and judging and few == 0, judging and few <= _FEW + 1e-6)
 
     def evidence(self) -> Evidence | None:
         """What was found last, as long as the scales are what it was found by; None: it is to be found anew."""

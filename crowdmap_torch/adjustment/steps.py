@@ -14,7 +14,8 @@ from crowdmap_torch.processes.memory import give_back
 from crowdmap_torch.processes.threads import one_core_each
 
 _NEAR = 2.0
-"""Scales move nothing where all steps to come take landmarks no further than the last one may, by this factor."""
+"""Scales of a few drives move nothing where all steps to come take landmarks no further than the last one may, by this
+factor: the map rests on the other drives."""
 
 
 @one_core_each()
@@ -65,7 +66,8 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     # Scales that no longer move anything are at rest, however much they still change: little is known of them.
     # One short step does not tell: it may be the last before other detections count.
     moves = torch.maximum(state.in_sigmas_before, state.in_sigmas_left)
-    settled = state.done and bool((moves < _NEAR * bundle.config.lm.move_tolerance).all())
+    near = bundle.config.lm.move_tolerance * (_NEAR if found.judging else 1.0)
+    settled = state.done and bool((moves < near).all())
     at_rest = found.scales or settled
     soon = first or bool(bundle.unjudged.any())
     if (found.judging or settled if soon else at_rest and state.done) and bundle.judge(normal):

@@ -242,8 +242,7 @@ def _map(
         progress("covariances and map")
         result = mapper.finish_map(dataset, maps, last, bundle, state, config, by, uncertainty)
         watch.finish(bundle, result.hd_map)
-    # What follows is written and drawn: on the CPU, wherever it was made.
-    dataset, result = to_device((dataset, result), "cpu")
+    dataset, result = to_device((dataset, result), "cpu")  # To be written and drawn.
     folder.write_result(dataset, result, config, tile_level=options.tiles)
 
     # ---- its errors against the survey, the report ----
