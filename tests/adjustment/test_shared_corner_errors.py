@@ -276,6 +276,7 @@ def with_boxes(bundle: Bundle, share: float, seed: int) -> Bundle:
     observed = {"px": rows.px + error, "matrix": matrix, "loose_px": loose, "detection": number}
     changed.see(replace(rows, **observed))
     changed.given_up = torch.zeros(int(number.max()) + 1, dtype=torch.bool)
+    changed.unjudged = torch.zeros_like(changed.given_up)
     changed.lasting.zero_()
     changed.lasting_each.zero_()
     # As if poses were known: each shift is its own innovation.
