@@ -196,7 +196,7 @@ class Bundle(BundleState):
         moved[:, WANDER_SCALE:] *= _SCALE_RESTS / _WANDER_RESTS
         creeps.append(moved[:, :WANDER_SCALE])
         creep = (torch.cat(creeps, dim=1) > 1).any(1).double().mean()
-        few = float(creep + 1e-9 * (moved > 1).any())  # One number from where they are.
+        few = float(creep + 1e-9 * (moved > 1).any())  # Of wander alone next to none, but not none.
         self.refreshed.fill_(True)
         return AtRest(at_rest and judging and few == 0, judging and few <= _FEW + 1e-6)
 
