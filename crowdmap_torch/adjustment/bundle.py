@@ -178,7 +178,7 @@ class Bundle(BundleState):
             self.held_off.copy_(evidence.held_off)
             self.innovation.copy_(evidence.innovation)
         judging, at_rest = self._narrow(values, foreseen)
-        creeps = [torch.zeros_like(self.prior_scale[:, :1])]
+        creeps: list[Tensor] = []
         if evidence is not None:
             creeps.append(self._rescale_noise(values, evidence))
         if of_border is not None:
