@@ -68,9 +68,9 @@ class KeptLead:
         """V."""
         return self.both[:, len(self.both) :]
 
-    def blocks(self) -> Lead:
-        """The same block by block."""
-        return Lead(self.both.permute(2, 0, 1).contiguous())
+    def blocks(self, some: slice = slice(None)) -> Lead:
+        """The same block by block, of `some` of them."""
+        return Lead(self.both[..., some].permute(2, 0, 1).contiguous())
 
 
 def lead_of(

@@ -74,8 +74,7 @@ class ChainBorder:
         def of_part(of: tuple[Part, Sequence[KeptLead]]) -> Through:
             part, leads = of
             chain, column = torch.unique(structure.owner[part.block], return_inverse=True)
-            beside = gradient[part.block][..., None]
-            return self.through(part, leads, self.link[part.block], beside, column, len(chain))
+            return self.through(part, leads, self.link, gradient[..., None], column, len(chain))
 
         every = list(zip(structure.parts, self.leads, strict=True))
         for found in in_order(of_part, every, gradient.device, worth=1):
@@ -92,21 +91,21 @@ class ChainBorder:
         self,
         part: Part,
         leads: Sequence[KeptLead],
-        right_side: Float[Tensor, "n k c"],
-        beside: Float[Tensor, "n k d"],
+        right_side: Float[Tensor, "e k c"],
+        beside: Float[Tensor, "e k d"],
         column: Int[Tensor, " n"],
         columns: int,
     ) -> Through:
-        """What A^-1 of right-hand sides of a part's blocks is to what stays.
+        """What A^-1 of right-hand sides of a part's blocks, among those of all, is to what stays.
 
         A few right-hand sides at a time: solved they are larger than all that is told of them. `column` is that of each
-        block in the landmarks' sums; the products with what stands `beside` are summed up as well.
+        of the part's blocks in the landmarks' sums; the products with what stands `beside` are summed up as well.
         """
         chain, of = torch.unique(self.structure.owner[part.block], return_inverse=True)
-        most = at_once(_NUMBERS, of.device) // max(right_side[..., :1].numel(), 1)
+        most = at_once(_NUMBERS, of.device) // max(len(of) * right_side.shape[1], 1)
         row, found = self._coupled(part), []
         for some in right_side.split(max(most, 1), dim=-1):
-            x = part.solved(leads, some)
+            x = part.solved(leads, some[part.block])
             by_landmark = self._couple(part, x, row, column, columns)
             found.append((by_landmark, *self._by_chain(part, x, of, len(chain), beside)))
         of_landmarks, of_chains, own = zip(*found, strict=True)
@@ -119,7 +118,7 @@ class ChainBorder:
         x: Float[Tensor, "places k c"],
         of: Int[Tensor, " n"],
         chains: int,
-        beside: Float[Tensor, "n k d"],
+        beside: Float[Tensor, "e k d"],
     ) -> tuple[Float[Tensor, "h b c"], Float[Tensor, "h c d"]]:
         """F^T x of a part, and x^T times what stands `beside`, chain by chain."""
         c = x.shape[-1]
@@ -127,9 +126,9 @@ class ChainBorder:
         own = x.new_zeros(chains, c, beside.shape[-1])
         lot = at_once(CHUNK_ROWS, of.device)
         for some in torch.arange(len(of), device=of.device).split(lot):
-            of_some = x[part.place[some]]
-            add_at(by_chain, 0, of[some], self.link[part.block[some]].mT @ of_some)
-            add_at(own, 0, of[some], of_some.mT @ beside[some])
+            of_some, block = x[part.place[some]], part.block[some]
+            add_at(by_chain, 0, of[some], self.link[block].mT @ of_some)
+            add_at(own, 0, of[some], of_some.mT @ beside[block])
         return by_chain, own
 
     def _coupled(self, part: Part) -> Int[Tensor, " r"]:
@@ -195,8 +194,7 @@ def weighted_sums(
     def of_part(one: tuple[Part, Sequence[KeptLead]]) -> tuple[Through, Tensor]:
         part, leads = one
         seen, column = torch.unique(of[structure.owner[part.block]], return_inverse=True)
-        w = full[part.block]
-        return chains.through(part, leads, w, w, column, len(seen)), seen
+        return chains.through(part, leads, full, full, column, len(seen)), seen
 
     row, of_sum, value = [], [], []
     for found, seen in in_order(of_part, every, weight.device, worth=1):

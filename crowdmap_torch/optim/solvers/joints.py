@@ -28,8 +28,14 @@ from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
+from crowdmap_torch.processes.amounts import at_once
 from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
+
+_AT_ONCE = 1 << 12
+"""Blocks that joints add to together on a CPU."""
+_NUMBERS = 1 << 19
+"""Numbers of right-hand sides that are solved for at once on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +98,15 @@ class Joints:
 
     def of_blocks(self, block: Int[Tensor, " m"]) -> Float[Tensor, "m k k"]:
         """What they add to the covariance of eliminated blocks."""
-        U, own = self.goes_with[block], self.owner[block]
-        chain, number = torch.unique(own, return_inverse=True)
-        return U @ self._between(chain, chain)[number] @ U.mT
+        chain, number = torch.unique(self.owner[block], return_inverse=True)
+        of_chain, k = self._between(chain, chain), self.goes_with.shape[1]
+        added = of_chain.new_empty(len(block), k, k)
+        lot = at_once(_AT_ONCE, block.device)
+        for begin in range(0, len(block), lot):
+            some = slice(begin, begin + lot)
+            U = self.goes_with[block[some]]
+            added[some] = U @ of_chain[number[some]] @ U.mT
+        return added
 
     def of_changes(self, changes: ChainChanges, first_block: int) -> Float[Tensor, "q m"]:
         """What they add to the variances of changes; chains' blocks are counted from `first_block` on."""
@@ -144,11 +156,15 @@ def joints_of(
     ) -> tuple[Float[Tensor, "n k q"], Float[Tensor, "chains q q"]]:
         part, own = of
         E = _towards_joints(structure, part, coupling, width)
-        U = part.solve(own, E)
         # Few blocks touch a joint.
         ends = torch.nonzero(E.flatten(1).any(1))[:, 0]
+        of_ends, U = E[ends], E
+        # In place, a few columns at a time: what is solved is several times as large.
+        most = max(1, at_once(_NUMBERS, like.device) // max(E[..., :1].numel(), 1))
+        for columns in U.split(most, dim=-1):
+            columns.copy_(part.solve(own, columns))
         taken = like.new_zeros(chains, 2 * width, 2 * width)
-        add_at(taken, 0, structure.owner[part.block[ends]], E[ends].mT @ U[ends])
+        add_at(taken, 0, structure.owner[part.block[ends]], of_ends.mT @ U[ends])
         return U, taken
 
     goes_with = like.new_empty(len(structure.owner), structure.width[plan.chains], 2 * width)

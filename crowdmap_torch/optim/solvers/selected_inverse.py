@@ -18,6 +18,10 @@ from torch import Tensor
 
 from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.parts import Part
+from crowdmap_torch.processes.amounts import at_once
+
+_AT_ONCE = 1 << 12
+"""Blocks of a round whose inverses are found together on a CPU."""
 
 
 def diagonal_of_inverse(
@@ -34,19 +38,25 @@ def diagonal_of_inverse(
     found = leads[0].whiten.new_zeros(len(part.at_place), k, k)
     # With the block that follows, of those known so far.
     crossed = torch.zeros_like(found)
+    lot = at_once(_AT_ONCE, found.device)
     for of_round, kept in zip(reversed(part.rounds[begun:]), reversed(leads[begun:]), strict=True):
-        lead = kept.blocks()
-        inverse, towards = lead.whiten.mT @ lead.whiten, lead.whiten.mT @ lead.towards
-        around = found[of_round.neighbour]
-        if of_round.neighbour.shape[1] == 2:
-            before = of_round.neighbour[:, 0]
-            both = crossed[before]
-            upper = torch.cat((around[:, 0], both), dim=-1)
-            beside = torch.cat((upper, torch.cat((both.mT, around[:, 1]), dim=-1)), dim=1)
-            with_neighbours = towards @ beside
-            crossed[before] = with_neighbours[..., :k].mT
-            crossed[of_round.place] = with_neighbours[..., k:]
-        else:
-            with_neighbours = towards @ around[:, 0]
-        found[of_round.place] = inverse + with_neighbours @ towards.mT
+        first = of_round.place.start
+        # Blocks of one round have nothing to do with each other.
+        for begin in range(0, len(of_round.neighbour), lot):
+            neighbour = of_round.neighbour[begin : begin + lot]
+            here = slice(first + begin, first + begin + len(neighbour))
+            lead = kept.blocks(slice(begin, begin + lot))
+            inverse, towards = lead.whiten.mT @ lead.whiten, lead.whiten.mT @ lead.towards
+            around = found[neighbour]
+            if neighbour.shape[1] == 2:
+                before = neighbour[:, 0]
+                both = crossed[before]
+                upper = torch.cat((around[:, 0], both), dim=-1)
+                beside = torch.cat((upper, torch.cat((both.mT, around[:, 1]), dim=-1)), dim=1)
+                with_neighbours = towards @ beside
+                crossed[before] = with_neighbours[..., :k].mT
+                crossed[here] = with_neighbours[..., k:]
+            else:
+                with_neighbours = towards @ around[:, 0]
+            found[here] = inverse + with_neighbours @ towards.mT
     return found[place]
