@@ -195,10 +195,10 @@ class Bundle(BundleState):
         moved = self._move("prior_scale", found) / _SCALE_RESTS
         moved[:, WANDER_SCALE:] *= _SCALE_RESTS / _WANDER_RESTS
         creeps.append(moved[:, :WANDER_SCALE])
-        creep = (torch.cat(creeps, dim=1) > 1).any(1).double().mean()
-        few = float(creep + 1e-9 * (moved > 1).any())  # Of wander alone next to none, but not none.
+        creep = float((torch.cat(creeps, dim=1) > 1).any(1).double().mean())
         self.refreshed.fill_(True)
-        return AtRest(at_rest and judging and few == 0, judging and few <= _FEW + 1e-6)
+        rest = at_rest and judging and creep == 0 and not bool((moved > 1).any())
+        return AtRest(rest, judging and creep <= _FEW + 1e-6)
 
     def evidence(self) -> Evidence | None:
         """What was found last, as long as the scales are what it was found by; None: it is to be found anew."""
