@@ -11,6 +11,9 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from crowdmap_torch import __version__
 from crowdmap_torch.config import MapperConfig, dump
 from crowdmap_torch.evaluation.evaluate import Against, evaluate_map, refuse_other_origin
@@ -26,11 +29,12 @@ from crowdmap_torch.io.runs import write_associations, write_refined_poses, writ
 from crowdmap_torch.io.sign_outcomes import NamedOutcomes, write_sign_outcomes
 from crowdmap_torch.io.surveys import read_survey
 from crowdmap_torch.io.truth import Truth, has_truth, read_associations, read_truth
-from crowdmap_torch.mapper import MapResult
+from crowdmap_torch.mapper import JourneyMap, MapResult
 from crowdmap_torch.processes.interrupts import held
+from crowdmap_torch.processes.threads import in_order
 from crowdmap_torch.runs.calibration import write_found
 from crowdmap_torch.runs.lock import locked
-from crowdmap_torch.tables import Dataset, HdMap, Origin, Survey
+from crowdmap_torch.tables import Dataset, HdMap, Journey, Origin, Survey
 
 _MAKES = (
     *("map", "map_clusters", "journeys", "associations.parquet", "config.yaml"),
@@ -297,9 +301,8 @@ class RunFolder:
                 path.unlink(missing_ok=True)
 
     def _write_journeys(self, folder: Path, dataset: Dataset, result: MapResult) -> None:
-        for journey, made, poses in zip(
-            dataset.journeys, result.journey_maps, result.poses, strict=True
-        ):
+        def written(of: tuple[Journey, JourneyMap, Tensor]) -> None:
+            journey, made, poses = of
             place = folder / journey.journey_id
             write_refined_poses(place / "poses.parquet", journey, poses)
             write_road_estimate(place / "road.parquet", journey.frame_number, made.road)
@@ -307,6 +310,10 @@ class RunFolder:
             write_signs(place / "signs.parquet", made.signs, signs, dataset.type_names)
             lanes = [f"{journey.journey_id}-l{i}" for i in range(len(made.lanes))]
             write_lanes(place / "lanes.parquet", made.lanes, lanes)
+
+        every = zip(dataset.journeys, result.journey_maps, result.poses, strict=True)
+        for _ in in_order(written, list(every), torch.device("cpu"), worth=1):
+            pass
 
 
 def _way(run: Path, dataset: Place) -> str:
