@@ -8,6 +8,7 @@ _ON_A_GPU = 64
 """There a call costs as much as work on a hundred thousand numbers, and cache matters little."""
 
 
-def at_once(count: int, device: torch.device) -> int:
-    """As much as `count` on a CPU."""
-    return count if device.type == "cpu" else count * _ON_A_GPU
+def at_once(count: int, device: torch.device, *, each: int = 1) -> int:
+    """As much as `count` on a CPU, in units of `each`, one of them at least."""
+    much = count if device.type == "cpu" else count * _ON_A_GPU
+    return max(much // max(each, 1), 1)

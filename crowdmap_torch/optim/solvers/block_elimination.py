@@ -68,8 +68,8 @@ class KeptLead:
         """V."""
         return self.both[:, len(self.both) :]
 
-    def blocks(self, some: slice = slice(None)) -> Lead:
-        """The same block by block, of `some` of them."""
+    def blocks(self, some: slice) -> Lead:
+        """The same of some blocks, block by block."""
         return Lead(self.both[..., some].permute(2, 0, 1).contiguous())
 
 
@@ -155,7 +155,7 @@ def _by_lots(
 ) -> Iterator[tuple[slice, slice]]:
     """The blocks of a round and their places in `rest`, as many at once as suit the device."""
     first, count = of_round.place.start - gone, of_round.place.stop - of_round.place.start
-    size = max(1, at_once(_LOT, rest.device) // max(rest[..., :1].numel(), 1))
+    size = at_once(_LOT, rest.device, each=rest[..., :1].numel())
     for begin in range(0, count, size):
         end = min(begin + size, count)
         yield slice(begin, end), slice(first + begin, first + end)

@@ -102,9 +102,9 @@ class ChainBorder:
         of the part's blocks in the landmarks' sums; the products with what stands `beside` are summed up as well.
         """
         chain, of = torch.unique(self.structure.owner[part.block], return_inverse=True)
-        most = at_once(_NUMBERS, of.device) // max(len(of) * right_side.shape[1], 1)
+        most = at_once(_NUMBERS, of.device, each=len(of) * right_side.shape[1])
         row, found = self._coupled(part), []
-        for some in right_side.split(max(most, 1), dim=-1):
+        for some in right_side.split(most, dim=-1):
             x = part.solved(leads, some[part.block])
             by_landmark = self._couple(part, x, row, column, columns)
             found.append((by_landmark, *self._by_chain(part, x, of, len(chain), beside)))

@@ -160,7 +160,7 @@ def joints_of(
         ends = torch.nonzero(E.flatten(1).any(1))[:, 0]
         of_ends, U = E[ends], E
         # In place, a few columns at a time: what is solved is several times as large.
-        most = max(1, at_once(_NUMBERS, like.device) // max(E[..., :1].numel(), 1))
+        most = at_once(_NUMBERS, like.device, each=E[..., :1].numel())
         for columns in U.split(most, dim=-1):
             columns.copy_(part.solve(own, columns))
         taken = like.new_zeros(chains, 2 * width, 2 * width)

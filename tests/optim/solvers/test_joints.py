@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
+from crowdmap_torch.optim.solvers import joints as joints_module
 from crowdmap_torch.optim.solvers.joints import JointChain, Joints
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 
@@ -47,7 +49,11 @@ def between(
     return torch.linalg.inv(whole)[rows][:, columns]
 
 
-def test_blocks_and_changes_are_those_of_their_chains_joints():
+@pytest.mark.parametrize("lot", [5, 1 << 12])
+def test_blocks_and_changes_are_those_of_their_chains_joints(
+    lot: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(joints_module, "_AT_ONCE", lot)
     joints, diagonal, link = joined(chains=4, blocks=12)
     found = joints.of_blocks(torch.arange(24))
     for k, U in enumerate(joints.goes_with):

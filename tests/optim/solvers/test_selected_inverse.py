@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import CostTerm, Problem, Variable, euclidean
+from crowdmap_torch.optim.solvers import selected_inverse
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
@@ -35,7 +36,11 @@ def structure(lengths: list[int], carrier: Tensor | None) -> ChainStructure:
 
 @pytest.mark.parametrize("lengths", [[1], [2], [5, 1, 8], [33]])
 @pytest.mark.parametrize("leaves", [0, 7])
-def test_blocks_are_those_of_the_dense_inverse(lengths: list[int], leaves: int):
+@pytest.mark.parametrize("lot", [2, 1 << 12])
+def test_blocks_are_those_of_the_dense_inverse(
+    lengths: list[int], leaves: int, lot: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(selected_inverse, "_AT_ONCE", lot)
     generator = torch.Generator().manual_seed(sum(lengths))
     nodes = sum(lengths)
     chain = torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths))
