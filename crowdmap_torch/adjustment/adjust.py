@@ -23,6 +23,7 @@ from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.calibration import CalibrationConfig, fleet_of
 from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.convoys import Convoys
+from crowdmap_torch.adjustment.course import course_of, states_at_cuts
 from crowdmap_torch.adjustment.covariance import MapUncertainty
 from crowdmap_torch.adjustment.cuts import cut_drives
 from crowdmap_torch.adjustment.footing import Footing, stand_on
@@ -127,11 +128,15 @@ def build(
         *(journeys, given[frame], nodes, positioning, config.prior, cut), error=at_nodes[:, :3]
     )
     at_start = poses.with_wander(at_nodes)
+    is_bound = config.method != "paper2017" and config.course.reach_m > 0
+    course = course_of(journeys, frame, nodes, poses.cut, config.course) if is_bound else None
+    stance = at_nodes.new_zeros(len(journeys) if is_bound else 0, 2)
     values = {
         "pose": start[frame],
         "drift": at_start,
-        "cut": poses.at_cuts(at_start),
+        "cut": states_at_cuts(poses, course, at_start, stance),
         "bias": nodes.mean(at_nodes, len(journeys)),
+        "stance": stance,
         "sign": signs.T_world_sign,
         "size": signs.size,
         "lane": lane,
@@ -141,7 +146,7 @@ def build(
     values |= fleet.start
     up = up_of_road(observed, values["pose"], lane, lanes.control_count)
     fixed = fixed_terms(values, signs, lanes, up, observed.corners, control, config)
-    priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet)
+    priors = Priors(poses, fixed, _nearest_poses(values["pose"], values["lane"]), fleet, course)
     bundle = Bundle(Unknowns(values, frame, lanes.control_count), observed, priors, config)
     if footing is not None:
         stand_on(bundle, footing)

@@ -23,7 +23,7 @@ from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
 from crowdmap_torch.adjustment.shared_corner_errors import Lasting, lasting_errors, shared_errors
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, pose_evidence, white_scales
-from crowdmap_torch.noise.pose_prior import CUT_TERMS, WANDER_SCALE
+from crowdmap_torch.noise.pose_prior import WANDER_SCALE
 from crowdmap_torch.optim.innovation_gate import innovations
 from crowdmap_torch.optim.linearize import first_blocks
 from crowdmap_torch.optim.linearize import residuals as whitened_residuals
@@ -124,12 +124,12 @@ class Bundle(BundleState):
         """
         prior, terms = self.prior, (self._corner_term, self._lane_terms)
         seen = {name: term for make in terms for name, term in make(1.0).items()}
-        at_cuts = prior.terms(self.prior_scale, self.white_scale)
-        seen |= {name: at_cuts[name] for name in CUT_TERMS if name in at_cuts}
+        of_poses = self.pose_terms(self.prior_scale)
+        seen |= {name: term for name, term in of_poses.items() if name.endswith("_cut")}
         of_journey = prior.journey_of_chain
         plan = EliminationPlan(
             *("drift", prior.chain, "pose", prior.nodes.of_frame),
-            border={"bias": of_journey, **self.fleet.blocks(of_journey)},
+            border=dict.fromkeys(self.of_drives, of_journey) | self.fleet.blocks(of_journey),
             joints="cut",
             joint=prior.joint,
         )
@@ -379,7 +379,7 @@ class Bundle(BundleState):
     def _terms(self, prior_scale: Float[Tensor, "j _"]) -> dict[str, CostTerm]:
         if not bool(self.refreshed):
             self.refresh()
-        terms = self.prior.terms(prior_scale, self.white_scale)
+        terms = self.pose_terms(prior_scale)
         if self.together.leads:
             terms |= self.fixed | calibration_priors.priors(self.fleet, self.calibration_scales)
             size = self.values()["size"]

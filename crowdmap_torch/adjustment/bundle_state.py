@@ -20,7 +20,7 @@ from crowdmap_torch.adjustment.observations import CornerObservations, LanePoint
 from crowdmap_torch.adjustment.parts import VARIABLES, Observations, Priors, SharedOut, Unknowns
 from crowdmap_torch.adjustment.relinearisation import Linearised, relinearise
 from crowdmap_torch.adjustment.shared_corner_errors import CornerDetections, KeptDetections
-from crowdmap_torch.optim.problem import Variable, euclidean, pull_euclidean
+from crowdmap_torch.optim.problem import CostTerm, Variable, euclidean, pull_euclidean
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.journey_system import JourneyBackend
 from crowdmap_torch.processes.at_rest import rest
@@ -103,7 +103,8 @@ class BundleState(nn.Module):
         self.variables = VARIABLES | own
         wide = values["drift"].shape[1]
         for name in ("drift", "cut"):
-            self.variables[name] = replace(VARIABLES[name], tangent_dim=wide)
+            dim = values[name].shape[1]
+            self.variables[name] = replace(VARIABLES[name], tangent_dim=dim)
         self.names = tuple(values)
         for name, value in values.items():
             self.register_buffer(f"base_{name}", value.clone())
@@ -141,6 +142,7 @@ class BundleState(nn.Module):
         self.lane_points = replace(points, matrix=points.matrix.clone())
         self.lenses = observations.lenses
         self.prior, self.fixed, self.beside = priors.poses, priors.fixed, priors.beside
+        self.course = priors.course
         # Where each lane point was followed to is part of the state: matching starts from there.
         matches = observations.matches
         self._match_lane, self._match_begun = matches.lane, matches.t
@@ -151,6 +153,18 @@ class BundleState(nn.Module):
         self._by_optics = _no_derivatives(self.fleet, self.corners, self.lane_points)
         self._by_mount = self.fleet.by_mount(values["pose"])
         self._backend: ChainBackend | JourneyBackend | None = None
+
+    @property
+    def of_drives(self) -> tuple[str, ...]:
+        """The unknowns that each drive has of its own for good."""
+        return ("bias",) if self.course is None else ("bias", "stance")
+
+    def pose_terms(self, prior_scale: Float[Tensor, "j _"]) -> dict[str, CostTerm]:
+        """What is known of poses beside images: how far positioning may be off, and where cars point."""
+        terms = self.prior.terms(prior_scale, self.white_scale)
+        if self.course is not None:
+            terms |= self.course.terms(self.prior.white_sigma, self.white_scale)
+        return terms
 
     @property
     def matches(self) -> LaneMatches:

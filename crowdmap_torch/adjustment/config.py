@@ -23,9 +23,26 @@ from crowdmap_torch.ranges import (
     Spacing,
 )
 from crowdmap_torch.residuals.sign_prior import SignHabit
+from crowdmap_torch.road.nonholonomic import NonholonomicConfig
 
 METHODS = ("joint", "paper2017")
 JACOBIANS = ("closed", "autograd")
+
+
+@dataclass(frozen=True)
+class CourseConfig(Settings):
+    """What the way that a car takes says of its poses' errors."""
+
+    reach_m: LengthOrNone = 8.0
+    """Stretches of the drift are bound by it where they are less than this apart; 0: none are."""
+    nonholonomic: NonholonomicConfig = field(default_factory=NonholonomicConfig)
+    """How far cars hold that constraint."""
+    slip_sigma_rad: Sigma = 0.03
+    """1-sigma of the angle between the camera's axis and the car's, beyond what poses show of it."""
+    lever_sigma_m: Sigma = 1.0
+    """1-sigma of the distance of the camera from the axle that does not steer, likewise."""
+    tukey_c: Deviations = 6.0
+    """Where a car parts from where it points by more standard deviations than this, it says nothing: positions may leap."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +68,8 @@ class AdjustConfig(Settings):
     faster and the same."""
     prior: PosePriorConfig = field(default_factory=PosePriorConfig)
     """What the poses may be wrong by."""
+    course: CourseConfig = field(default_factory=CourseConfig)
+    """What the way that a car takes says of them; method `joint`."""
     tukey_c: Deviations = 4.685
     """Residuals beyond this many standard deviations have no weight; the corners of a detection are judged together, by a
     bound that is as efficient."""

@@ -82,6 +82,7 @@ def convoy(bundle: Bundle, state: LmState | None, first: int, last: int) -> Conv
     corners, points = bundle.corners[corner], bundle.lane_points[point]
     beside = bundle.beside - of_poses.start
     is_here = (beside >= 0) & (bundle.beside < of_poses.stop)
+    prior = bundle.prior.of_journeys(first, last)
     kept = {k: v for k, v in bundle.state_dict().items() if k not in bundle.unknown_names}
     of_sign = corner[bundle.detections.first]
     rows = dict.fromkeys(_ROWS, point) | {"poses_left": of_poses}
@@ -102,10 +103,11 @@ def convoy(bundle: Bundle, state: LmState | None, first: int, last: int) -> Conv
             *(bundle.begun_matches[point], bundle.lenses),
         ),
         priors=Priors(
-            bundle.prior.of_journeys(first, last),
+            prior,
             bundle.fixed,
             torch.where(is_here, beside, -1),
             _of_poses(bundle.fleet, of_poses),
+            bundle.course and bundle.course.of_nodes(of_nodes.start, of_nodes.stop, prior.journeys),
         ),
         config=bundle.config,
         plan=_plan(bundle, of_nodes, of_poses),

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.course import states_at_cuts
 
 _SCALES = (
     *("scale", "small_box", "lasting", "lasting_each", "share_there"),
@@ -52,7 +53,7 @@ def footing_of(bundle: Bundle) -> Footing:
         bundle.frame[nodes.first],
         nodes.journey,
         values["drift"],
-        {name: values[name] for name in ("bias", *bundle.fleet.start)},
+        {name: values[name] for name in ("bias", "stance", *bundle.fleet.start)},
         {name: getattr(bundle, name).clone() for name in _SCALES},
         int(bundle.judged) > 0,
         bundle.given_up.clone(),
@@ -87,7 +88,8 @@ def stand_on(bundle: Bundle, footing: Footing) -> None:
         values["drift"][:, :wide] = torch.where(
             known, footing.drift[row, :wide], values["drift"][:, :wide]
         )
-        values["cut"] = bundle.prior.at_cuts(values["drift"])
+        of_drives = values["drift"], values["stance"]
+        values["cut"] = states_at_cuts(bundle.prior, bundle.course, *of_drives)
     for name, there in footing.scales.items():
         here = getattr(bundle, name)
         if name in _BY_KIND:

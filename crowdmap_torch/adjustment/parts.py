@@ -8,6 +8,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from crowdmap_torch.adjustment.calibration import Fleet
+from crowdmap_torch.adjustment.course import Course
 from crowdmap_torch.adjustment.lane_matching import LaneMatches
 from crowdmap_torch.adjustment.observations import CornerObservations, LanePointObservations
 from crowdmap_torch.geometry import se3
@@ -29,12 +30,13 @@ VARIABLES = {
     "drift": Variable(6, euclidean, pull=pull_euclidean),
     "cut": Variable(6, euclidean, pull=pull_euclidean),
     "bias": Variable(6, euclidean, pull=pull_euclidean),
+    "stance": Variable(2, euclidean, pull=pull_euclidean),
     "sign": Variable(6, se3.retract, pull=se3.pull),
     "size": Variable(2, positive, pull=pull_positive),
     "lane": Variable(3, euclidean, pull=pull_euclidean),
 }
 """The unknowns: camera poses, their slow errors, at stretches of road and where long drives are cut, and each journey's
-constant one; signs, their sides, lanes' coefficients."""
+constant one; how its camera stands in the car; signs, their sides, lanes' coefficients."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,8 @@ class Priors:
     """The pose nearest to each lane coefficient at the start; -1: it is another's."""
     fleet: Fleet
     """What cars have wrong for good."""
+    course: Course | None
+    """What the way of cars says; None: nothing is asked of it."""
 
 
 @dataclass(frozen=True)

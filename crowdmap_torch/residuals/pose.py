@@ -57,29 +57,33 @@ def gauss_markov_start(
 
 
 def gauss_markov_step(
-    before: Float[Tensor, "k *#rows"],
-    after: Float[Tensor, "k *#rows"],
+    before: Float[Tensor, "b *#rows"],
+    after: Float[Tensor, "a *#rows"],
     mean: Float[Tensor, "k *#rows"],
     keep: Float[Tensor, "k *#rows"],
 ) -> Float[Tensor, "k *#rows"]:
-    """Innovation of a Gauss-Markov chain from one place to the next, which the share `keep` of what was is left at."""
-    return after - mean - keep * (before - mean)
+    """Innovation of a Gauss-Markov chain from one place to the next, which the share `keep` of what was is left at.
+
+    What is cut has a number behind its state that is none of it (`parting_before_cut`).
+    """
+    k = len(keep)
+    return after[:k] - mean - keep * (before[:k] - mean)
 
 
 def wandering_start(
-    state: Float[Tensor, "9 *#rows"], mean: Float[Tensor, "6 *#rows"]
+    state: Float[Tensor, "k *#rows"], mean: Float[Tensor, "6 *#rows"]
 ) -> Float[Tensor, "9 *#rows"]:
     """How far the first state of a drift is from a bias that wanders, and that from its mean.
 
     The state is the pose error (6) and how far the bias of the position is from its `mean` there (3).
     """
-    wander = state[6:]
+    wander = state[6:9]
     return torch.cat((state[:3] - wander - mean[:3], state[3:6] - mean[3:], wander))
 
 
 def wandering_step(
-    before: Float[Tensor, "9 *#rows"],
-    after: Float[Tensor, "9 *#rows"],
+    before: Float[Tensor, "b *#rows"],
+    after: Float[Tensor, "a *#rows"],
     mean: Float[Tensor, "6 *#rows"],
     keep: Float[Tensor, "9 *#rows"],
 ) -> Float[Tensor, "9 *#rows"]:
@@ -96,6 +100,44 @@ def sideways_parting(
 ) -> Float[Tensor, "1 *#rows"]:
     """How far measured and reckoned path part sideways from knot to knot, once drift and slip are taken off [m]."""
     return seen + (by_before * before + by_after * after).sum(0, keepdim=True)
+
+
+def parting_of_course(
+    before: Float[Tensor, "k *#rows"],
+    after: Float[Tensor, "k *#rows"],
+    stance: Float[Tensor, "2 *#rows"],
+    seen: Float[Tensor, "*#rows"],
+    of_before: Float[Tensor, "6 *#rows"],
+    of_after: Float[Tensor, "6 *#rows"],
+    of_stance: Float[Tensor, "2 *#rows"],
+) -> Float[Tensor, "1 *#rows"]:
+    """`sideways_parting` where slip and lever are the same along the drive, and drifts may have more numbers than a pose."""
+    of_drift = of_before * before[:6] + of_after * after[:6]
+    return seen + of_drift.sum(0, keepdim=True) + (of_stance * stance).sum(0, keepdim=True)
+
+
+def parting_before_cut(
+    before: Float[Tensor, "k *#rows"],
+    cut: Float[Tensor, "c *#rows"],
+    stance: Float[Tensor, "2 *#rows"],
+    seen: Float[Tensor, "*#rows"],
+    of_before: Float[Tensor, "6 *#rows"],
+    of_stance: Float[Tensor, "2 *#rows"],
+) -> Float[Tensor, "1 *#rows"]:
+    """`parting_of_course` as far as is known before a cut, less what the cut has of it: its last number."""
+    return (
+        parting_of_course(before, before, stance, seen, of_before, 0 * of_before, of_stance)
+        - cut[-1:]
+    )
+
+
+def parting_behind_cut(
+    cut: Float[Tensor, "c *#rows"],
+    after: Float[Tensor, "k *#rows"],
+    of_after: Float[Tensor, "6 *#rows"],
+) -> Float[Tensor, "1 *#rows"]:
+    """What the cut has of `parting_of_course`, and what the drift behind it adds."""
+    return cut[-1:] + (of_after * after[:6]).sum(0, keepdim=True)
 
 
 def pose_prior_jacobian(
@@ -138,39 +180,80 @@ def relative_pose_jacobian(
 
 
 def gauss_markov_step_jacobian(
-    before: Float[Tensor, "k m"],
-    after: Float[Tensor, "k m"],
+    before: Float[Tensor, "b m"],
+    after: Float[Tensor, "a m"],
     mean: Float[Tensor, "k m"],
     keep: Float[Tensor, "k m"],
 ) -> tuple[Float[Tensor, "k m"], tuple[Jacobian, ...]]:
     """`gauss_markov_step` and its Jacobians by the two states and the mean."""
-    by = (-keep, torch.ones_like(keep), keep - 1)
+    by = ((before, -keep), (after, torch.ones_like(keep)), (mean, keep - 1))
     error = gauss_markov_step(before, after, mean, keep)
-    return error, tuple(SparseJacobian.diagonal(entries) for entries in by)
+    return error, tuple(
+        SparseJacobian(len(of), SparseJacobian.diagonal(entries).rows) for of, entries in by
+    )
 
 
 def wandering_step_jacobian(
-    before: Float[Tensor, "9 m"],
-    after: Float[Tensor, "9 m"],
+    before: Float[Tensor, "b m"],
+    after: Float[Tensor, "a m"],
     mean: Float[Tensor, "6 m"],
     keep: Float[Tensor, "9 m"],
 ) -> tuple[Float[Tensor, "9 m"], tuple[Jacobian, ...]]:
     """`wandering_step` and its Jacobians by the two states and the mean."""
     one, none = torch.ones_like(keep), torch.zeros_like(keep[:3])
 
-    def by_state(factor: Float[Tensor, "9 m"]) -> SparseJacobian:
+    def by_state(state: Tensor, factor: Float[Tensor, "9 m"]) -> SparseJacobian:
         diagonal = SparseJacobian.diagonal(factor).rows
         # Position and wander of an axis are six apart.
         drawn = (
             (i, torch.cat((factor[i : i + 1], none, none[:2], -factor[i : i + 1])))
             for i in range(3)
         )
-        return SparseJacobian(9, (*drawn, *diagonal[3:]))
+        return SparseJacobian(len(state), (*drawn, *diagonal[3:]))
 
     of_mean = SparseJacobian.diagonal((keep - 1)[:6]).rows
     by_mean = SparseJacobian(6, (*of_mean, *((0, none[:1]) for _ in range(3))))
     error = wandering_step(before, after, mean, keep)
-    return error, (by_state(-keep), by_state(one), by_mean)
+    return error, (by_state(before, -keep), by_state(after, one), by_mean)
+
+
+def parting_of_course_jacobian(
+    before: Float[Tensor, "k m"],
+    after: Float[Tensor, "k m"],
+    stance: Float[Tensor, "2 m"],
+    seen: Float[Tensor, " m"],
+    of_before: Float[Tensor, "6 m"],
+    of_after: Float[Tensor, "6 m"],
+    of_stance: Float[Tensor, "2 m"],
+) -> tuple[Float[Tensor, "1 m"], tuple[Jacobian, ...]]:
+    """`parting_of_course` and its Jacobians by the two drifts and the stance."""
+    error = parting_of_course(before, after, stance, seen, of_before, of_after, of_stance)
+    of_drifts = (SparseJacobian(len(before), ((0, by),)) for by in (of_before, of_after))
+    return error, (*of_drifts, SparseJacobian(2, ((0, of_stance),)))
+
+
+def parting_before_cut_jacobian(
+    before: Float[Tensor, "k m"],
+    cut: Float[Tensor, "c m"],
+    stance: Float[Tensor, "2 m"],
+    seen: Float[Tensor, " m"],
+    of_before: Float[Tensor, "6 m"],
+    of_stance: Float[Tensor, "2 m"],
+) -> tuple[Float[Tensor, "1 m"], tuple[Jacobian, ...]]:
+    """`parting_before_cut` and its Jacobians by the drift, the cut and the stance."""
+    error = parting_before_cut(before, cut, stance, seen, of_before, of_stance)
+    last = SparseJacobian(len(cut), ((len(cut) - 1, -torch.ones_like(error)),))
+    of_drift = SparseJacobian(len(before), ((0, of_before),))
+    return error, (of_drift, last, SparseJacobian(2, ((0, of_stance),)))
+
+
+def parting_behind_cut_jacobian(
+    cut: Float[Tensor, "c m"], after: Float[Tensor, "k m"], of_after: Float[Tensor, "6 m"]
+) -> tuple[Float[Tensor, "1 m"], tuple[Jacobian, ...]]:
+    """`parting_behind_cut` and its Jacobians by the cut and the drift."""
+    error = parting_behind_cut(cut, after, of_after)
+    last = SparseJacobian(len(cut), ((len(cut) - 1, torch.ones_like(error)),))
+    return error, (last, SparseJacobian(len(after), ((0, of_after),)))
 
 
 def _step(

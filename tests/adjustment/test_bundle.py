@@ -245,7 +245,7 @@ def test_bundles_of_the_same_observations_take_lenses_anew_each_by_itself(
     other = Bundle(
         Unknowns(one.values(), one.frame, one.lane_count),
         observed,
-        Priors(one.prior, one.fixed, one.beside, one.fleet),
+        Priors(one.prior, one.fixed, one.beside, one.fleet, one.course),
         one.config,
     )
     before = observed.corners.matrix.clone(), observed.lane_points.matrix.clone()

@@ -41,6 +41,9 @@ CATALOGUE: dict[Callable[..., Tensor], tuple[str, ...]] = {
     pose.wandering_start: ("wander", "error"),
     pose.wandering_step: ("wander", "wander", "error"),
     pose.sideways_parting: ("drift", "drift"),
+    pose.parting_of_course: ("drift", "drift", "stance"),
+    pose.parting_before_cut: ("drift", "error", "stance"),
+    pose.parting_behind_cut: ("error", "drift"),
     sign_prior.sign_habit: ("pose", "size"),
     sign_prior.sign_place: ("pose", "size"),
     sign_prior.size_class: ("size",),
@@ -54,6 +57,7 @@ KINDS = {
     "error": Variable(6, euclidean),
     "wander": Variable(9, euclidean),
     "optics": Variable(7, euclidean),
+    "stance": Variable(2, euclidean),
 }
 ROWS = 24
 CORNERS = 3
@@ -101,6 +105,8 @@ def drawn() -> dict[str, Tensor]:
     names |= dict(optics=noise(7), left_m=noise(7, scale=0.1), by_optics=noise(7))
     names["left_world"] = torch.nn.functional.normalize(noise(3), dim=-1)
     names["wandering_keep"] = noise(9).sigmoid()
+    names |= dict(stance=noise(2), of_before=noise(6), of_after=noise(6), of_stance=noise(2))
+    names["cut"] = noise(6)
     return names | {f"c{i}": point + step for i, step in enumerate(steps)}
 
 

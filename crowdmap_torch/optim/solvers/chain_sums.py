@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from itertools import accumulate, pairwise
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from crowdmap_torch.optim.problem import Problem, Values
@@ -14,7 +14,7 @@ from crowdmap_torch.optim.solvers.assembly import BlockDiagonal, TermRows, pairs
 from crowdmap_torch.optim.solvers.couplings import TermFactors
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, padded
 from crowdmap_torch.optim.solvers.staying_blocks import Between, StayingBlocks
-from crowdmap_torch.processes.sums import add_at
+from crowdmap_torch.processes.sums import add_at, lasting
 
 
 class ChainSums:
@@ -44,9 +44,9 @@ class ChainSums:
         for i, j in pairs(len(chunk.slots)):
             (name, block), (other, block_of_other) = chunk.slots[i], chunk.slots[j]
             if name in first and other in first:
-                here, there = block + first[name], block_of_other + first[other]
+                begins = first[name], first[other]
                 square = padded(chunk.blocks.hessian[i, j].permute(2, 0, 1), 1, self._k)
-                self._add_link(here, there, padded(square, 2, self._k))
+                self._add_link(block, block_of_other, begins, padded(square, 2, self._k))
             elif name in first and other in self.border:
                 beside = padded(chunk.blocks.hessian[i, j].permute(2, 0, 1), 1, self._k)
                 add_at(self.border[other], 0, block + first[name], beside)
@@ -72,8 +72,26 @@ class ChainSums:
         return self.structure.stack({name: self.by_variable.gradient(name) for name in names})
 
     def _add_link(
-        self, here: Int[Tensor, " m"], there: Int[Tensor, " m"], block: Float[Tensor, "m k k"]
+        self,
+        here: Int[Tensor, " m"],
+        there: Int[Tensor, " m"],
+        begins: tuple[int, int],
+        block: Float[Tensor, "m k k"],
     ) -> None:
+        """Adds blocks between eliminated ones of two variables, which begin there among all that are eliminated."""
+
+        def linked() -> tuple[Int[Tensor, " m"], Bool[Tensor, " m"], bool]:
+            return self._linked(here + begins[0], there + begins[1])
+
+        low, ahead, in_order = lasting(("linked", *begins), linked, here, there)
+        if not in_order:
+            block = torch.where(ahead[:, None, None], block, block.mT)
+        add_at(self.link, 0, low, block)
+
+    def _linked(
+        self, here: Int[Tensor, " m"], there: Int[Tensor, " m"]
+    ) -> tuple[Int[Tensor, " m"], Bool[Tensor, " m"], bool]:
+        """The first of each two, whether that is `here`, and whether it always is; ValueError for what cannot be linked."""
         low, high = torch.minimum(here, there), torch.maximum(here, there)
         plan, owner = self.structure.plan, self.structure.owner
         leaves = plan.leaf_count
@@ -81,15 +99,14 @@ class ChainSums:
         if plan.carrier is not None:
             of_leaf = (low < leaves) & (high >= leaves)
             linked[of_leaf] = plan.carrier[low[of_leaf]] == high[of_leaf] - leaves
-        is_linked, in_order = torch.stack((linked.all(), (here < there).all())).tolist()
+        ahead = here < there
+        is_linked, in_order = torch.stack((linked.all(), ahead.all())).tolist()
         if not is_linked:
             raise ValueError(
                 "a term links two eliminated blocks that are neither neighbours in their chain "
                 "nor a leaf and the block that carries it"
             )
-        if not in_order:
-            block = torch.where((here < there)[:, None, None], block, block.mT)
-        add_at(self.link, 0, low, block)
+        return low, ahead, in_order
 
 
 class ReducibleSums(ChainSums):
