@@ -67,11 +67,13 @@ def nodes_of(journeys: list[Journey], frame: Tensor, spacing: float = 1.0) -> Dr
     return drift_nodes(torch.searchsorted(ends, frame, right=True), way, spacing)
 
 
-def bound(journeys: list[Journey], frame: Tensor) -> tuple[Course, DriftNodes, Problem, dict]:
+def bound(
+    journeys: list[Journey], frame: Tensor, cut: Tensor | None = None
+) -> tuple[Course, DriftNodes, Problem, dict]:
     """The course of drives, and the problem that it makes with the prior of their poses."""
     nodes = nodes_of(journeys, frame)
     pose = torch.cat([journey.T_world_camera for journey in journeys])[frame]
-    prior = pose_prior(journeys, pose, nodes, NOISE, PosePriorConfig())
+    prior = pose_prior(journeys, pose, nodes, NOISE, PosePriorConfig(), cut)
     course = course_of(journeys, frame, nodes, prior.cut, CONFIG)
     ones = torch.ones(len(journeys), 6, dtype=F64)
     terms = course.terms(prior.white_sigma, ones) | prior.terms(ones[:, : prior.scale_count], ones)
@@ -154,6 +156,44 @@ def test_drives_of_which_nothing_is_in_the_bundle_have_none():
     )
     assert course.journey.unique().tolist() == [0]
     assert nodes.journey[-1] == 2 and course.journeys.tolist() == [0, 1, 2]
+
+
+def test_stretches_that_are_far_apart_are_not_bound():
+    journeys, _ = drives()
+    # Fifteen metres of the first drive show nothing, three of the second.
+    frame = torch.cat((torch.arange(100), torch.arange(130, 300), torch.arange(306, 400)))
+    course, nodes, _, _ = bound(journeys, frame)
+    gap = nodes.way[1:] - nodes.way[:-1]
+    one_drive = nodes.journey[1:] == nodes.journey[:-1]
+    near = torch.nonzero(one_drive & (gap < CONFIG.reach_m))[:, 0]
+    assert torch.equal(course.before, near) and float(gap[near].max()) > 2.5
+    assert int((one_drive & (gap >= CONFIG.reach_m)).sum()) == 1
+
+
+def test_the_parting_at_a_cut_is_in_two_halves():
+    """Each half as far off, and both together as much as the whole."""
+    journeys, _ = drives()
+    frame = torch.arange(400)
+    whole, nodes, problem, values = bound(journeys, frame)
+    cut = torch.tensor([40, 150])
+    course, _, in_two, _ = bound(journeys, frame, cut)
+    generator = torch.Generator().manual_seed(3)
+    for name in ("drift", "stance"):
+        shape = values[name].shape
+        values[name] = 0.02 * torch.randn(shape, generator=generator, dtype=F64)
+    number = course.at_cuts(values["drift"], values["stance"])
+    state = torch.zeros(2, values["drift"].shape[1], dtype=F64)
+    values["cut"] = torch.cat((state, number), dim=1)
+    before, behind = (
+        residuals(in_two.terms[f"course_{side}_cut"], values) for side in ("before", "behind")
+    )
+    torch.testing.assert_close(before, behind)
+    at_cut = torch.isin(whole.before, cut - 1)
+    expected = residuals(problem.terms["course"], values)[at_cut]
+    torch.testing.assert_close(before.square() + behind.square(), expected.square())
+    kept = residuals(in_two.terms["course"], values)
+    torch.testing.assert_close(kept, residuals(problem.terms["course"], values)[~at_cut])
+    assert len(nodes.first) > 190 and course.cut[at_cut].tolist() == [0, 1]
 
 
 def test_parts_of_all_drives_have_their_own_course():
