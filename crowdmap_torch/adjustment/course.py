@@ -33,6 +33,8 @@ from crowdmap_torch.tables import Journey
 
 _UNBOUND_M = 1e3
 """1-sigma of the parting where none is asked for."""
+_SUREST_M = 1e-3
+"""Least 1-sigma of it: of a car that hardly moves, by poses that are said to have no noise, there would be none."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ class Course:
     ) -> dict[str, CostTerm]:
         """What binds the drift of neighbours, and what is usual of stances; by the noise of poses from frame to frame."""
         white = (white_sigma * white_scale)[:, :2].square().mean(1)
-        weight = 1 / (white[self.journey] * self.frames + self.variance).sqrt()
+        variance = white[self.journey] * self.frames + self.variance
+        weight = 1 / variance.sqrt().clamp_min(_SUREST_M)
         usual = weight.new_tensor((self.config.slip_sigma_rad, self.config.lever_sigma_m))
         nothing = torch.zeros_like(usual).expand(len(self.journeys), 2)
         inner, at_cut = self._rows

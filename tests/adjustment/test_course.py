@@ -148,6 +148,15 @@ def test_noise_from_frame_to_frame_binds_less():
     assert bool((loud[second] < 0.4 * quiet[second]).all())
 
 
+def test_a_car_that_stands_under_poses_without_noise_weighs_no_more_than_a_number():
+    journeys, _ = drives()
+    course = bound(journeys, torch.arange(400))[0]
+    standing = replace(course, variance=torch.zeros_like(course.variance))
+    none = torch.zeros(6, dtype=F64)
+    weight = standing.terms(none, torch.ones(2, 6, dtype=F64))["course"].weight
+    assert weight is not None and bool((weight == 1e3).all())
+
+
 def test_drives_of_which_nothing_is_in_the_bundle_have_none():
     journeys, _ = drives()
     short = replace(make_journey(RIG, straight_poses(1, step_m=0.5)), journey_id="journey-2")
