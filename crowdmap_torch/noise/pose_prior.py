@@ -43,6 +43,8 @@ _CYCLES = 5
 """Extrapolations of the alternation between scales and what all journeys share."""
 WANDER_SCALE = 3
 """Column of the scales that is of the bias's wander, where there is any: behind bias, drift and rotation."""
+_LEAST_WHITE = 1e-5
+"""Least noise of poses from frame to frame [m, rad]: where it is none a pose would weigh infinitely much at its node."""
 MOST_NUMBERS = 9
 """Numbers of the drift at a node, at most."""
 
@@ -379,6 +381,7 @@ def pose_prior(
     )
     length = pose.new_tensor([positioning.drift_length_m] * 3 + [positioning.rotation_length_m] * 3)
     white = pose.new_tensor([positioning.white_sigma_m] * 3 + [positioning.white_sigma_rad] * 3)
+    white = white.clamp_min(_LEAST_WHITE)
     begins = torch.nonzero(begins_of(nodes.journey))[:, 0]
     cut = begins[:0] if cut is None else cut
     follows = nodes.journey[1:] == nodes.journey[:-1]

@@ -10,6 +10,8 @@ from torch import Tensor
 from worlds.drives import make_journey
 from worlds.sign_drive import F64, RIG, straight_poses
 
+from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.calibration import CalibrationConfig
 from crowdmap_torch.adjustment.config import AdjustConfig, CourseConfig
 from crowdmap_torch.adjustment.course import Course, course_of
 from crowdmap_torch.adjustment.observations import frame_offsets
@@ -232,3 +234,16 @@ def test_a_bundle_has_it_unless_it_is_switched_off(street, change, is_bound):
     assert ("course" in bundle.problem().terms) == is_bound
     assert ("stance" in bundle.plan.border) == is_bound
     assert len(bundle.values()["stance"]) == (len(bundle.prior_scale) if is_bound else 0)
+
+
+def test_poses_that_are_said_to_have_no_noise_are_adjusted(street):
+    """A car that stands at a node has neither a way that it could part from nor noise beside its drift."""
+    quiet = PositioningNoise(white_sigma_m=0.0, white_sigma_deg=0.0)
+    bundle = street.bundle(positioning=quiet, calibration=CalibrationConfig())
+    begun = adjust.start(bundle)
+    taken = adjust.steps(bundle, begun)
+    states = [state for _, (_, state, _) in zip(range(2), taken, strict=False)]
+    taken.close()
+    assert bool(states[0].accepted.all()) and states[0].cost < begun.cost
+    assert all(bool(value.isfinite().all()) for value in bundle.values().values())
+    assert bool(bundle.white_scale.isfinite().all())
