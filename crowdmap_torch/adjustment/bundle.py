@@ -125,7 +125,7 @@ class Bundle(BundleState):
         prior, terms = self.prior, (self._corner_term, self._lane_terms)
         seen = {name: term for make in terms for name, term in make(1.0).items()}
         of_poses = self.pose_terms(self.prior_scale)
-        seen |= {name: term for name, term in of_poses.items() if name.endswith("_cut")}
+        seen |= {name: term for name, term in of_poses.items() if "cut" in dict(term.slots)}
         of_journey = prior.journey_of_chain
         plan = EliminationPlan(
             *("drift", prior.chain, "pose", prior.nodes.of_frame),

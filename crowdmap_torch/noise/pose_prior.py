@@ -37,7 +37,7 @@ from crowdmap_torch.ranges import Freedom, Length, Settings
 from crowdmap_torch.residuals import pose as residuals
 from crowdmap_torch.tables import Journey
 
-CUT_TERMS = ("pose_before_cut", "pose_behind_cut")
+_CUT_TERMS = ("pose_before_cut", "pose_behind_cut")
 """The terms by which states at cuts are bound to the nodes around them."""
 _CYCLES = 5
 """Extrapolations of the alternation between scales and what all journeys share."""
@@ -207,7 +207,7 @@ class PosePrior:
 
         cuts = {}
         if len(self.cut):
-            cuts = {name: steps(name, self.cut - 1, 0.5) for name in CUT_TERMS}
+            cuts = {name: steps(name, self.cut - 1, 0.5) for name in _CUT_TERMS}
         return {
             "pose_bias": CostTerm(
                 residuals.gauss_markov_start,

@@ -125,10 +125,8 @@ def parting_before_cut(
     of_stance: Float[Tensor, "2 *#rows"],
 ) -> Float[Tensor, "1 *#rows"]:
     """`parting_of_course` as far as is known before a cut, less what the cut has of it: its last number."""
-    return (
-        parting_of_course(before, before, stance, seen, of_before, 0 * of_before, of_stance)
-        - cut[-1:]
-    )
+    of_drift = (of_before * before[:6]).sum(0, keepdim=True)
+    return seen + of_drift + (of_stance * stance).sum(0, keepdim=True) - cut[-1:]
 
 
 def parting_behind_cut(
