@@ -35,6 +35,8 @@ _UNBOUND_M = 1e3
 """1-sigma of the parting where none is asked for."""
 _SUREST_M = 1e-3
 """Least 1-sigma of it: of a car that hardly moves, by poses that are said to have no noise, there would be none."""
+_LEAST = 1e-9
+"""Weight that is left to a parting that says nothing: where it is at a cut, nothing else holds the number there."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Course:
                 bound,
                 (*(x[inner] for x in (self.seen, self.of_before, self.of_after, self.of_stance)),),
                 weight=weight[inner],
-                loss=Tukey(self.config.tukey_c),
+                loss=Tukey(self.config.tukey_c, _LEAST),
                 jacobian=residuals.parting_of_course_jacobian,
             ),
             "stance": CostTerm(
@@ -104,7 +106,7 @@ class Course:
         }
         if len(at_cut):
             # Two losses of half the parting are the loss of the whole.
-            half, loss = 2**0.5 * weight[at_cut], Tukey(self.config.tukey_c / 2**0.5)
+            half, loss = 2**0.5 * weight[at_cut], Tukey(self.config.tukey_c / 2**0.5, _LEAST)
             found["course_before_cut"] = CostTerm(
                 residuals.parting_before_cut,
                 before_cut,

@@ -90,15 +90,19 @@ class Tukey:
     """Tukey's biweight: an observation beyond `c` standard deviations has no say (V-B; Zhang 1997)."""
 
     c: float | Float[Tensor, "*batch"] = 4.685
+    least: float = 0.0
+    """Weight that is left to all observations, such as of what nothing else holds."""
 
     def rho(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """`c^2 / 3 (1 - (1 - s / c^2)^3)` up to `c^2`, constant beyond."""
+        """`c^2 / 3 (1 - (1 - s / c^2)^3)` up to `c^2`, constant beyond, and `least s`."""
         inside = (1 - s / self.c**2).clamp_min(0)
-        return self.c**2 / 3 * (1 - inside * inside * inside)
+        bounded = self.c**2 / 3 * (1 - inside * inside * inside)
+        return bounded + self.least * s if self.least else bounded
 
     def weight(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """`(1 - s / c^2)^2` up to `c^2`, zero beyond."""
-        return (1 - s / self.c**2).clamp_min(0).square()
+        """`(1 - s / c^2)^2` up to `c^2`, zero beyond, and `least`."""
+        bounded = (1 - s / self.c**2).clamp_min(0).square()
+        return bounded + self.least if self.least else bounded
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ WAVES = [
     0.15 * torch.sin(torch.arange(240, dtype=F64) / 13),
     0.10 * torch.cos(torch.arange(160, dtype=F64) / 11),
 ]
+SIDES = ("before", "behind")
 LEVERS = [{"lever": 1.6, "yaw": 0.02}, {"lever": -0.4, "yaw": -0.03}]
 
 
@@ -247,3 +248,22 @@ def test_poses_that_are_said_to_have_no_noise_are_adjusted(street):
     assert bool(states[0].accepted.all()) and states[0].cost < begun.cost
     assert all(bool(value.isfinite().all()) for value in bundle.values().values())
     assert bool(bundle.white_scale.isfinite().all())
+
+
+def test_a_leap_where_a_drive_is_cut_leaves_the_rest_as_it_is(street):
+    """Nothing else holds the number that the cut has of the parting there."""
+    config = replace(AdjustConfig(), cut_unknowns=60)
+    bundle = street.bundle(config=config)
+    leapt = (bundle.course.cut >= 0) & (bundle.course.before % 2 == 0)
+    assert int(leapt.sum()) > 2
+    bundle.course = replace(bundle.course, seen=bundle.course.seen + 5.0 * leapt)
+    values = bundle.values()
+    bundle.base_cut[:, -1:] = bundle.course.at_cuts(values["drift"], values["stance"])
+    taken = adjust.steps(bundle, adjust.start(bundle))
+    states = [state for _, (_, state, _) in zip(range(3), taken, strict=False)]
+    taken.close()
+    assert bool(states[-1].accepted.all())
+    sides = [residuals(bundle.problem().terms[f"course_{x}_cut"], bundle.values()) for x in SIDES]
+    parted = (sides[0] + sides[1])[leapt[bundle.course.cut >= 0]]
+    # Neither half draws what lies before the leap to what lies behind it.
+    assert bool((parted.abs() > 100).all()), parted

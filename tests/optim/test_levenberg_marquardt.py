@@ -177,7 +177,7 @@ def test_positive_numbers_stay_positive():
     assert (values > 0).all()
 
 
-@pytest.mark.parametrize("loss", [Quadratic(), Huber(1.345), Tukey(4.685)])
+@pytest.mark.parametrize("loss", [Quadratic(), Huber(1.345), Tukey(4.685), Tukey(4.685, 0.01)])
 def test_weights_are_the_derivative_of_the_loss(loss):
     s = torch.linspace(0.01, 40, 200, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(loss.rho(s).sum(), s)
