@@ -90,6 +90,10 @@ def map_uncertainty(
             give_back()
             covariance = equations.covariance()
             of_bias = covariance.of_sums(*sums_of_bias(bundle))
+    if len(bundle.convoys) > 1:
+        # The convoys are gone, and with them who else had the factors.
+        covariance = covariance.resting()
+        give_back()
     to_bias = bias_of_poses(values["pose"][nodes.first])
     count = torch.bincount(nodes.journey, minlength=journeys)
     every = torch.arange(len(signs), device=count.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 
 import torch
@@ -14,6 +15,7 @@ from crowdmap_torch.optim.solvers.layout import Layout, read_entries
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
+from crowdmap_torch.processes.at_rest import rest
 
 SumsOfChains = Callable[[Tensor, Tensor, int], tuple[Tensor, WeightedSums] | None]
 _COLUMNS = 256
@@ -40,6 +42,18 @@ class LandmarkCovariance:
         """
         self.where = where
         self._factor, self._sums, self._is_current = factor, sums, is_current
+
+    def resting(self) -> LandmarkCovariance:
+        """The same, its factors in a file: while the inverse is made, which is as large, they take no memory.
+
+        Of sums over chains it tells nothing more.
+        """
+        self._check()
+        upper = self._factor.upper
+        upper = replace(upper, flat=rest(upper.flat))
+        return LandmarkCovariance(
+            self.where, TiledCholesky(upper), lambda *_: None, is_current=lambda: True
+        )
 
     @cached_property
     def _inverse(self) -> TileMatrix:
@@ -75,7 +89,7 @@ class LandmarkCovariance:
         """
         self._check()
         told = self._sums(weight, of, count)
-        assert told is not None, "asked of who has the factors"
+        assert told is not None, "asked of who has the chains"
         found, sums = told
         m = weight.shape[-1]
         each = max(_COLUMNS // m, 1)

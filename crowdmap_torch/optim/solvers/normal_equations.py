@@ -174,6 +174,10 @@ class MapCovariance(Covariance, Protocol):
         """Covariance of the mean over all blocks of such a variable."""
         ...
 
+    def resting(self) -> MapCovariance:
+        """The same with what it is found from in a file; of sums over chains it tells nothing more."""
+        ...
+
     def of_sums(
         self, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
     ) -> Float[Tensor, "j m m"]:

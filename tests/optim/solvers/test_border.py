@@ -18,6 +18,7 @@ from crowdmap_torch.optim import levenberg_marquardt as lm
 from crowdmap_torch.optim.solvers import border
 from crowdmap_torch.optim.solvers.chain_schur import ChainBackend
 from crowdmap_torch.optim.solvers.dense import DenseBackend
+from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
 
 
 @pytest.fixture(params=["all", "one by one"])
@@ -141,6 +142,23 @@ def test_a_covariance_whose_factors_are_gone_is_refused():
     normal.solve(torch.tensor([1e-3], dtype=torch.float64))
     with pytest.raises(ValueError, match="solved since"):
         covariance.of_sums(torch.zeros(len(plan.chain), 2, 1).double(), torch.arange(3), 3)
+
+
+def test_a_covariance_at_rest_outlives_the_factors():
+    problem, values, plan = drives(marks=400)
+    normal = ChainBackend(plan).assemble(problem, values)
+    functions = LinearFunctions.of_tangents(
+        (("mark", torch.arange(400)),), values["mark"], values["mark"].shape[1]
+    )
+    expected = normal.covariance().of(functions)
+    right_side = torch.ones(normal.structure.where.dim, 1).double()
+    solved = normal.covariance().solve(right_side)
+    resting = normal.covariance().resting()
+    normal.solve(torch.tensor([1e-3], dtype=torch.float64))
+    assert torch.equal(resting.of(functions), expected)
+    assert torch.equal(resting.solve(right_side), solved)
+    with pytest.raises(AssertionError, match="who has the chains"):
+        resting.of_sums(torch.zeros(len(plan.chain), 2, 1).double(), torch.arange(3), 3)
 
 
 @pytest.mark.parametrize("world", [drives, shared_drives, wandering_drives])
