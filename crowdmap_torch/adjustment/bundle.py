@@ -208,22 +208,19 @@ class Bundle(BundleState):
 
     def told_by(self, equations: MapEquations, corners: CostTerm | None) -> Evidence:
         """What normal equations solved at the bundle's scales, and their term of `corners`, tell of poses' errors."""
-        told, left, off = torch.zeros_like(self.drift_told), self.poses_left, self.held_off
-        innovation = self.innovation
-        if len(left):
-            found = pose_evidence(self.prior, equations, self.prior_scale)
-            told, left = found.told, found.left
+        off, innovation = self.held_off, self.innovation
+        found = pose_evidence(self.prior, equations, self.prior_scale)
         if corners is not None and len(off) and self.config.method != "paper2017":
             values, detections = self.values(), self.detections
             runs = detections.run, len(off)
             of_pose = equations.conditional_covariance("pose")
             by_prior = left_by_prior(equations, of_pose)
             _, gradient, tells = first_blocks(corners, self.variables, values, *runs)
-            whose = self.corners.journey, len(told)
+            whose = self.corners.journey, len(found.told)
             off = held_off(corners, detections, values, tells, by_prior, *whose)
             seen = corners, detections, self.variables, values
             innovation = shift_innovations(*seen, gradient, tells, of_pose, by_prior)
-        return Evidence(self._of_journeys(told), left, off, innovation)
+        return Evidence(self._of_journeys(found.told), found.left, off, innovation)
 
     def _white_term(self) -> CostTerm:
         """Of poses' errors from frame to frame."""

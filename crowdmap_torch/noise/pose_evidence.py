@@ -2,7 +2,8 @@
 
 An estimate follows its prior where nothing is seen, and says nothing of it. How much it does say is one less the share of
 the prior's variance that is left when all is observed; of many numbers, the sum of these shares is the effective number of
-well determined ones (MacKay, Bayesian Interpolation, 1992): what sums of squares are divided by.
+well determined ones (MacKay, Bayesian Interpolation, 1992): what sums of squares are divided by. Landmarks are as unknown as
+the poses: a sign that one drive passes goes where the drive wants it, and tells next to nothing of where that was.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from crowdmap_torch.noise.pose_prior import PosePrior
 from crowdmap_torch.optim.solvers.normal_equations import ChainChanges, MapEquations
 from crowdmap_torch.processes.sums import add_at
 
-_SAMPLED = 8
+_SAMPLED = 16
 """Changes of a journey whose variances are asked for, at most."""
+_CHANGES = 50
+"""Of many journeys about so many in all, and one of each at least: they tell of the fleet together."""
 _WHITE_TRUST = 24.0
 """Well determined numbers that the noise from frame to frame as it is given counts as, and that of all axes in one's."""
 _WHITE_SCALES = (1.0, MOST_SCALE)
@@ -28,13 +31,13 @@ _WHITE_SCALES = (1.0, MOST_SCALE)
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """What the observations of a bundle tell of its poses' errors, the landmarks known."""
+    """What the observations of a bundle tell of its poses' errors."""
 
     told: Float[Tensor, "j k"]
     """By journey and number of a pose, the share of the drift's changes that observations tell; behind them, where the
     bias wanders, those of its wander."""
     left: Float[Tensor, "p 6"]
-    """Variance that is left of every pose's deviation from its drift."""
+    """Variance that is left of every pose's deviation from its drift, the landmarks known."""
 
 
 def pose_evidence(
@@ -42,7 +45,8 @@ def pose_evidence(
 ) -> PoseEvidence:
     """That at the point of normal equations, which have been solved, with the prior's scales that they were made with."""
     told = share_of_changes_told(prior, equations, scale)
-    return PoseEvidence(told, equations.variance_of_leaves())
+    left = equations.variance_of_leaves() if len(prior.pose) else prior.pose.new_zeros(0, 6)
+    return PoseEvidence(told, left)
 
 
 def share_of_changes_told(
@@ -51,8 +55,7 @@ def share_of_changes_told(
     """By journey and number, the share of the changes of its drift, and of its wander, that observations tell."""
     told = prior.bias_sigma.new_ones(len(scale), prior.numbers)
     changes = sampled_changes(prior, prior.far, prior.about_bias(_numbers(prior)))
-    if len(changes.pair):
-        told[:, :6] = share_told(prior, changes, equations.variance_of_changes(changes), scale)
+    told[:, :6] = share_told(prior, changes, equations.variance_of_changes(changes), scale)
     if prior.wander is not None:
         changes = sampled_changes(prior, prior.wander.far, _numbers(prior)[:, 6:])
         told[:, 6:] = _wander_told(prior, changes, equations.variance_of_changes(changes), scale)
@@ -68,13 +71,17 @@ def sampled_changes(
     prior: PosePrior, pair: Int[Tensor, "q 2"], of: Float[Tensor, "k m"]
 ) -> ChainChanges:
     """Some of the changes that scales are told by, spread over each journey: as many as are solved for at once."""
-    journey = prior.nodes.journey[pair[:, 0]]
+    journey, drives = prior.nodes.journey[pair[:, 0]], len(prior.bias_sigma)
+    most = max(min(_SAMPLED, _CHANGES // max(drives, 1)), 1)
     _, group, count = torch.unique_consecutive(journey, return_inverse=True, return_counts=True)
     rank = torch.arange(len(group), device=group.device) - (count.cumsum(0) - count)[group]
-    column = torch.where(count[group] > _SAMPLED, rank * _SAMPLED // count[group], rank)
+    column = torch.where(count[group] > most, rank * most // count[group], rank)
     starts = torch.ones_like(column, dtype=torch.bool)
     starts[1:] = (column[1:] != column[:-1]) | (group[1:] != group[:-1])
-    return ChainChanges(pair[starts], column[starts], of)
+    return ChainChanges(
+        *(pair[starts], column[starts], most, journey[starts], of),
+        *(prior.journey_of_chain, drives),
+    )
 
 
 def share_told(

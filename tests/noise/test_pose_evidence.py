@@ -40,10 +40,11 @@ def test_changes_are_told_by_what_is_left_of_their_variance():
 
 def test_no_more_changes_are_asked_for_than_are_solved_at_once():
     short, long = (changes_of(make_prior(2, way_m=way)) for way in (400.0, 9000.0))
-    assert short.columns == 3 and long.columns == 8
-    for changes, most in ((short, 3), (long, 8)):
-        assert torch.bincount(changes.column).tolist() == [2] * most
-    assert changes_of(make_prior(2, way_m=50.0)).columns == 0
+    for changes, most in ((short, 3), (long, 16)):
+        assert changes.columns == 16 and torch.bincount(changes.column).tolist() == [2] * most
+    assert len(changes_of(make_prior(2, way_m=50.0)).pair) == 0
+    many = changes_of(make_prior(60, way_m=400.0))
+    assert many.columns == 1 and many.whose.tolist() == list(range(60))
 
 
 def estimated(noise: Tensor, sigma: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:

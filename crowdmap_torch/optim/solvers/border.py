@@ -11,7 +11,7 @@ The factor's tiles take the border as they take landmarks: one that no drive pas
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from crowdmap_torch.optim.linearize import CHUNK_ROWS
 from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
-from crowdmap_torch.optim.solvers.normal_equations import BorderInformation
+from crowdmap_torch.optim.solvers.normal_equations import BorderInformation, ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
@@ -31,6 +31,10 @@ from crowdmap_torch.processes.threads import in_order
 
 _NUMBERS = 1 << 20
 """Numbers of right-hand sides that are solved for at once on a CPU."""
+_COLUMNS = 256
+"""Functions of what stays that are solved for at once; bounds the memory."""
+PartWeights = Callable[[int, Part], Tensor]
+"""What the blocks of a part, by its number, count in sums over chains: [n, k, m], in their order, leaves first."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,8 @@ class ChainBorder:
         def of_part(of: tuple[Part, Sequence[KeptLead]]) -> Through:
             part, leads = of
             chain, column = torch.unique(structure.owner[part.block], return_inverse=True)
-            return self.through(part, leads, self.link, gradient[..., None], column, len(chain))
+            own = self.link[part.block], gradient[part.block][..., None]
+            return self.through(part, leads, *own, column, len(chain))
 
         every = list(zip(structure.parts, self.leads, strict=True))
         for found in in_order(of_part, every, gradient.device, worth=1):
@@ -91,12 +96,12 @@ class ChainBorder:
         self,
         part: Part,
         leads: Sequence[KeptLead],
-        right_side: Float[Tensor, "e k c"],
-        beside: Float[Tensor, "e k d"],
+        right_side: Float[Tensor, "n k c"],
+        beside: Float[Tensor, "n k d"],
         column: Int[Tensor, " n"],
         columns: int,
     ) -> Through:
-        """What A^-1 of right-hand sides of a part's blocks, among those of all, is to what stays.
+        """What A^-1 of right-hand sides of a part's blocks is to what stays.
 
         A few right-hand sides at a time: solved they are larger than all that is told of them. `column` is that of each
         of the part's blocks in the landmarks' sums; the products with what stands `beside` are summed up as well.
@@ -105,7 +110,7 @@ class ChainBorder:
         most = at_once(_NUMBERS, of.device, each=len(of) * right_side.shape[1])
         row, found = self._coupled(part), []
         for some in right_side.split(most, dim=-1):
-            x = part.solved(leads, some[part.block])
+            x = part.solved(leads, some)
             by_landmark = self._couple(part, x, row, column, columns)
             found.append((by_landmark, *self._by_chain(part, x, of, len(chain), beside)))
         of_landmarks, of_chains, own = zip(*found, strict=True)
@@ -118,7 +123,7 @@ class ChainBorder:
         x: Float[Tensor, "places k c"],
         of: Int[Tensor, " n"],
         chains: int,
-        beside: Float[Tensor, "e k d"],
+        beside: Float[Tensor, "n k d"],
     ) -> tuple[Float[Tensor, "h b c"], Float[Tensor, "h c d"]]:
         """F^T x of a part, and x^T times what stands `beside`, chain by chain."""
         c = x.shape[-1]
@@ -126,9 +131,9 @@ class ChainBorder:
         own = x.new_zeros(chains, c, beside.shape[-1])
         lot = at_once(CHUNK_ROWS, of.device)
         for some in torch.arange(len(of), device=of.device).split(lot):
-            of_some, block = x[part.place[some]], part.block[some]
-            add_at(by_chain, 0, of[some], self.link[block].mT @ of_some)
-            add_at(own, 0, of[some], of_some.mT @ beside[block])
+            of_some = x[part.place[some]]
+            add_at(by_chain, 0, of[some], self.link[part.block[some]].mT @ of_some)
+            add_at(own, 0, of[some], of_some.mT @ beside[some])
         return by_chain, own
 
     def _coupled(self, part: Part) -> Int[Tensor, " r"]:
@@ -178,26 +183,68 @@ class WeightedSums:
         at = self.row[here] * (end - begin) + self.of[here] - begin
         return add_at(total, 0, at, self.value[here]).view(dim, end - begin, -1)
 
+    def variance(self, factor: TiledCholesky, count: int) -> Float[Tensor, "sums m m"]:
+        """What they vary by as what stays does, by the factors of its system."""
+        m, dim = self.value.shape[1], factor.upper.pattern.dim
+        found, each = self.value.new_zeros(count, m, m), max(_COLUMNS // max(m, 1), 1)
+        for begin in range(0, count, each):
+            end = min(begin + each, count)
+            functions = self.functions(begin, end, dim).flatten(1)
+            through = factor.whitened(functions).unflatten(1, (-1, m))
+            found[begin:end] = torch.einsum("rjm,rjn->jmn", through, through)
+        return found
+
+
+Sums = tuple[Tensor, WeightedSums]
+"""Covariance of sums over chains, what stays known [j, m, m], and how they go with what stays."""
+
 
 def weighted_sums(
     chains: ChainBorder, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
-) -> tuple[Float[Tensor, "j m m"], WeightedSums]:
-    """Covariance of weighted sums over chains' blocks, what stays known, and how they go with what stays.
+) -> Sums:
+    """Weighted sums over chains' blocks, leaves left out; `of` says of which of the sums each chain is."""
+    leaves = chains.structure.plan.leaf_count
 
-    Leaves are left out; `of` says of which of the sums each chain is.
-    """
-    structure, m = chains.structure, weight.shape[-1]
-    leaves = weight.new_zeros(structure.plan.leaf_count, *weight.shape[1:])
-    full, own = torch.cat((leaves, weight)), weight.new_zeros(count, m, m)
-    every = list(zip(structure.parts, chains.leads, strict=True))
+    def of_part(_: int, part: Part) -> Float[Tensor, "n k m"]:
+        own = weight.new_zeros(len(part.block), *weight.shape[1:])
+        own[part.leaf_count :] = weight[part.block[part.leaf_count :] - leaves]
+        return own
 
-    def of_part(one: tuple[Part, Sequence[KeptLead]]) -> tuple[Through, Tensor]:
-        part, leads = one
+    return _sums(chains, of_part, weight.shape[-1], of, count)
+
+
+def sums_of_changes(chains: ChainBorder, changes: ChainChanges) -> Sums:
+    """The changes along each drive as sums over its chains' blocks, column by column."""
+    structure, (k, m) = chains.structure, changes.of.shape
+    block = changes.pair + structure.plan.leaf_count
+    part_of, number = structure.plan.part_of_blocks[block], structure.number[block]
+
+    def of_part(own: int, part: Part) -> Float[Tensor, "n k c"]:
+        weight = changes.of.new_zeros(len(part.block), k, changes.columns, m)
+        for end, of in enumerate((-changes.of, changes.of)):
+            here = torch.nonzero(part_of[:, end] == own)[:, 0]
+            weight[number[here, end], :, changes.column[here]] += of
+        return weight.flatten(2)
+
+    return _sums(chains, of_part, changes.columns * m, changes.drive, changes.drives)
+
+
+def _sums(
+    chains: ChainBorder, weights: PartWeights, m: int, of: Int[Tensor, " chains"], count: int
+) -> Sums:
+    """Of `m` weighted sums each."""
+    structure, link = chains.structure, chains.link
+    own = link.new_zeros(count, m, m)
+    every = list(enumerate(zip(structure.parts, chains.leads, strict=True)))
+
+    def of_part(one: tuple[int, tuple[Part, Sequence[KeptLead]]]) -> tuple[Through, Tensor]:
+        number, (part, leads) = one
         seen, column = torch.unique(of[structure.owner[part.block]], return_inverse=True)
-        return chains.through(part, leads, full, full, column, len(seen)), seen
+        weight = weights(number, part)
+        return chains.through(part, leads, weight, weight, column, len(seen)), seen
 
     row, of_sum, value = [], [], []
-    for found, seen in in_order(of_part, every, weight.device, worth=1):
+    for found, seen in in_order(of_part, every, link.device, worth=1):
         add_at(own, 0, of[found.chain], found.own)
         entry = structure.border[found.chain]
         for rows, columns, of_each in (
@@ -208,11 +255,11 @@ def weighted_sums(
             row.append(rows.flatten())
             of_sum.append(columns.flatten())
             value.append(of_each.flatten(0, 1))
-    none = torch.zeros(0, dtype=torch.long, device=weight.device)
+    none = torch.zeros(0, dtype=torch.long, device=link.device)
     return own, WeightedSums(
         torch.cat([none, *row]),
         torch.cat([none, *of_sum]),
-        torch.cat([weight.new_zeros(0, m), *value]),
+        torch.cat([link.new_zeros(0, m), *value]),
     )
 
 

@@ -40,7 +40,12 @@ from crowdmap_torch.optim.solvers.block_elimination import (
     fill_chain,
     lead_of,
 )
-from crowdmap_torch.optim.solvers.border import ChainBorder, border_information, weighted_sums
+from crowdmap_torch.optim.solvers.border import (
+    ChainBorder,
+    border_information,
+    sums_of_changes,
+    weighted_sums,
+)
 from crowdmap_torch.optim.solvers.chain_sums import ReducibleSums
 from crowdmap_torch.optim.solvers.elimination import ChainStructure, analyse
 from crowdmap_torch.optim.solvers.known_landmarks import KnownLandmarks
@@ -231,8 +236,11 @@ class ChainNormalEquations:
         return self.known.of_leaves()
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
-        """Variances of the changes between blocks of chains: leaves marginalised, landmarks and border known."""
-        return self.known.of_changes(changes)
+        """Variances of changes along drives, nothing else known, by the last factors."""
+        factor = self.workspace.factor
+        assert factor is not None and factor.reduced is not None, "solved first"
+        known, sums = sums_of_changes(self.chains(factor.leads), changes)
+        return changes.variance(known + sums.variance(factor.reduced, changes.drives))
 
     def border_information(self) -> BorderInformation:
         """Information on the border, everything else marginalised, as the last step had it."""

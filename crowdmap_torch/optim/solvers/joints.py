@@ -25,7 +25,6 @@ from torch import Tensor
 
 from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
-from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
 from crowdmap_torch.processes.amounts import at_once
@@ -99,7 +98,7 @@ class Joints:
     def of_blocks(self, block: Int[Tensor, " m"]) -> Float[Tensor, "m k k"]:
         """What they add to the covariance of eliminated blocks."""
         chain, number = torch.unique(self.owner[block], return_inverse=True)
-        of_chain, k = self._between(chain, chain), self.goes_with.shape[1]
+        of_chain, k = self._of_chains(chain), self.goes_with.shape[1]
         added = of_chain.new_empty(len(block), k, k)
         lot = at_once(_AT_ONCE, block.device)
         for begin in range(0, len(block), lot):
@@ -108,29 +107,10 @@ class Joints:
             added[some] = U @ of_chain[number[some]] @ U.mT
         return added
 
-    def of_changes(self, changes: ChainChanges, first_block: int) -> Float[Tensor, "q m"]:
-        """What they add to the variances of changes; chains' blocks are counted from `first_block` on."""
-        first, second = (changes.pair + first_block).unbind(1)
-        a, b = self.goes_with[first].mT @ changes.of, self.goes_with[second].mT @ changes.of
-        of_first, of_second = self.owner[first], self.owner[second]
-
-        def product(
-            left: Tensor, chain: Tensor, other: Tensor, right: Tensor
-        ) -> Float[Tensor, "q m"]:
-            return (left * (self._between(chain, other) @ right)).sum(1)
-
-        alone = product(a, of_first, of_first, a) + product(b, of_second, of_second, b)
-        return alone - 2 * product(a, of_first, of_second, b)
-
-    def _between(
-        self, chain: Int[Tensor, " m"], other: Int[Tensor, " m"]
-    ) -> Float[Tensor, "m q q"]:
-        """The covariance of chains' joints with those of others of their drive."""
-        here, there = self.joint[chain], self.joint[other]
-        rows = [
-            torch.cat([self.covariance.between(here[:, i], there[:, j]) for j in range(2)], dim=2)
-            for i in range(2)
-        ]
+    def _of_chains(self, chain: Int[Tensor, " m"]) -> Float[Tensor, "m q q"]:
+        """The covariance of the joints of each chain."""
+        ends = self.joint[chain].unbind(1)
+        rows = [torch.cat([self.covariance.between(a, b) for b in ends], dim=2) for a in ends]
         return torch.cat(rows, dim=1)
 
 

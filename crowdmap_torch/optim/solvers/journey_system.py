@@ -25,8 +25,10 @@ from crowdmap_torch.optim.problem import Problem, Values
 from crowdmap_torch.optim.solvers.assembly import Costs, of_everybody
 from crowdmap_torch.optim.solvers.border import (
     ChainBorder,
+    Sums,
     WeightedSums,
     border_information,
+    sums_of_changes,
     weighted_sums,
 )
 from crowdmap_torch.optim.solvers.chain_schur import (
@@ -309,12 +311,10 @@ class JourneyEquations:
 
     def sums_of_chains(
         self, weight: Float[Tensor, "n k m"], of: Int[Tensor, " chains"], count: int
-    ) -> tuple[Float[Tensor, "j m m"], WeightedSums] | None:
+    ) -> Sums | None:
         """`weighted_sums` of all chains, of which each brings those of its own; of a member nothing."""
-        factor = self.own.workspace.factor
-        assert factor is not None
-        chains = self.own.chains(factor.leads)
-        return self.together.for_leader(_all_sums, _own_sums(chains, weight, of, count))
+        own = weighted_sums(self._chains, weight, of, count)
+        return self.together.for_leader(_all_sums, _brought(own))
 
     def conditional_covariance(self, name: str, *, told: float = 1.0) -> Float[Tensor, "n k k"]:
         """Covariance of every block of one's own, the landmarks known."""
@@ -325,8 +325,22 @@ class JourneyEquations:
         return self.own.variance_of_leaves()
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
-        """Variances of the changes between blocks of own chains, landmarks and border known."""
-        return self.own.variance_of_changes(changes)
+        """Variances of changes along own drives, nothing else known, by the last factors."""
+
+        def of_all(parts: Iterator[_Brought]) -> Float[Tensor, "drives c c"]:
+            assert self.summed.factor is not None, "solved first"
+            known, sums = _all_sums(parts)
+            return known + sums.variance(self.summed.factor, changes.drives)
+
+        own = sums_of_changes(self._chains, changes)
+        return changes.variance(self.together.met(of_all, _brought(own)))
+
+    @property
+    def _chains(self) -> ChainBorder:
+        """One's own, by the last factors."""
+        factor = self.own.workspace.factor
+        assert factor is not None, "solved first"
+        return self.own.chains(factor.leads)
 
     def border_information(self) -> BorderInformation:
         """Information on the border, everything else marginalised, as the last step had it; of a member nothing."""
@@ -389,16 +403,16 @@ def _along(step: Tensor, gradient: Tensor, added: Tensor) -> Float[Tensor, " 3"]
     )
 
 
-def _own_sums(
-    chains: ChainBorder, weight: Tensor, of: Tensor, count: int
-) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-    own, sums = weighted_sums(chains, weight, of, count)
-    return own, (sums.row, sums.of, sums.value)
+_Brought = tuple[Tensor, tuple[Tensor, Tensor, Tensor]]
+"""`Sums` as they are brought to a meeting."""
 
 
-def _all_sums(
-    parts: Iterator[tuple[Tensor, tuple[Tensor, Tensor, Tensor]]],
-) -> tuple[Tensor, WeightedSums]:
+def _brought(own: Sums) -> _Brought:
+    known, sums = own
+    return known, (sums.row, sums.of, sums.value)
+
+
+def _all_sums(parts: Iterator[_Brought]) -> Sums:
     every = list(parts)
     own = torch.stack([of for of, _ in every]).sum(0)
     return own, WeightedSums(

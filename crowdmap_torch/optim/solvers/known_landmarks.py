@@ -17,12 +17,10 @@ from torch import Tensor
 from crowdmap_torch.optim.solvers.block_elimination import KeptLead
 from crowdmap_torch.optim.solvers.elimination import ChainStructure
 from crowdmap_torch.optim.solvers.joints import Joints, joints_of
-from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 from crowdmap_torch.optim.solvers.parts import Part
 from crowdmap_torch.optim.solvers.selected_inverse import diagonal_of_inverse
 from crowdmap_torch.optim.solvers.staying_blocks import StayingBlocks
 from crowdmap_torch.processes.amounts import at_once
-from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.threads import in_order
 
 _AT_ONCE = 1 << 13
@@ -112,46 +110,3 @@ class KnownLandmarks:
         bounds = [*range(0, max(plan.leaf_count, 1), lot), plan.leaf_count]
         some = [slice(a, b) for a, b in pairwise(bounds)]
         return torch.cat(list(in_order(of_some, some, of_chain.device)))
-
-    def of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
-        """Variances of the changes between blocks of chains, leaves marginalised."""
-        structure, of = self.structure, changes.of
-        leaves = structure.plan.leaf_count
-        first, second = changes.pair.unbind(1)
-        is_within = structure.plan.chain[first] == structure.plan.chain[second]
-        within, across = (torch.nonzero(x)[:, 0] for x in (is_within, ~is_within))
-        variance = of.new_zeros(len(changes.pair), of.shape[1])
-        # Chains do not go with each other but through what stays, and joints.
-        for end in (first[across], second[across]):
-            variance[across] += (of * (self._of_chains[end] @ of)).sum(1)
-        end = torch.arange(2, device=of.device).repeat_interleave(len(within))
-        row = within.repeat(2)
-        block = changes.pair[within].T.flatten() + leaves
-        of_part, number = structure.plan.part_of_blocks[block], structure.number[block]
-        # One column at a time: all of them are several times as large as what is solved.
-        every = [
-            (part, leads, here)
-            for i, (part, leads) in enumerate(zip(structure.parts, self.leads, strict=True))
-            for here in _by_column(torch.nonzero(of_part == i)[:, 0], changes.column[row])
-        ]
-
-        def solved(of_one: tuple[Part, Sequence[KeptLead], Tensor]) -> Float[Tensor, "r m"]:
-            part, leads, here = of_one
-            sign = (2.0 * end[here] - 1)[:, None, None]
-            at = number[here] - part.leaf_count
-            right_side = of.new_zeros(len(part.block) - part.leaf_count, *of.shape)
-            right_side[at] = sign * of
-            found = part.solve_chains(leads, right_side)[at]
-            return (sign * of * found).sum(1)
-
-        for (*_, here), found in zip(every, in_order(solved, every, of.device), strict=True):
-            add_at(variance, 0, row[here], found)
-        if self.joints is not None:
-            variance += self.joints.of_changes(changes, leaves)
-        return variance
-
-
-def _by_column(row: Tensor, column: Tensor) -> list[Tensor]:
-    """Rows of one column each, column by column."""
-    own = column[row]
-    return [row[own == one] for one in torch.unique(own).tolist()]

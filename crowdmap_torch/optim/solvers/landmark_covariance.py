@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.border import WeightedSums
+from crowdmap_torch.optim.solvers.border import Sums
 from crowdmap_torch.optim.solvers.layout import Layout, read_entries
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.processes.at_rest import rest
 
-SumsOfChains = Callable[[Tensor, Tensor, int], tuple[Tensor, WeightedSums] | None]
+SumsOfChains = Callable[[Tensor, Tensor, int], Sums | None]
 _COLUMNS = 256
 """Functions whose joint covariance is solved for at once; bounds the memory."""
 
@@ -90,16 +90,8 @@ class LandmarkCovariance:
         self._check()
         told = self._sums(weight, of, count)
         assert told is not None, "asked of who has the chains"
-        found, sums = told
-        m = weight.shape[-1]
-        each = max(_COLUMNS // m, 1)
-        for begin in range(0, count, each):
-            end = min(begin + each, count)
-            through = self._factor.whitened(
-                sums.functions(begin, end, self.where.dim).flatten(1)
-            ).unflatten(1, (-1, m))
-            found[begin:end] += torch.einsum("rjm,rjn->jmn", through, through)
-        return found
+        known, sums = told
+        return known + sums.variance(self._factor, count)
 
     def solve(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
         """The covariance times right-hand sides; ValueError where the factors are there no more."""

@@ -131,19 +131,27 @@ class LinearFunctions:
 
 @dataclass(frozen=True)
 class ChainChanges:
-    """Changes along chains: differences between blocks of one chain."""
+    """Changes along drives: differences between blocks of chains of one drive."""
 
     pair: Int[Tensor, "q 2"]
     """The blocks, the first is subtracted."""
     column: Int[Tensor, " q"]
-    """Those of one column are of different chains, and asked for at once."""
+    """Those of one column are of different drives, and asked for at once."""
+    columns: int
+    """How many columns there may be; those who ask together have as many."""
+    whose: Int[Tensor, " q"]
+    """The drive of each."""
     of: Float[Tensor, "k m"]
     """By columns, the sums of a block's numbers whose changes they are."""
+    drive: Int[Tensor, " chains"]
+    """The drive of each chain."""
+    drives: int
+    """How many drives there are, whether any of them changes or not."""
 
-    @property
-    def columns(self) -> int:
-        """How many columns there are."""
-        return int(self.column.max()) + 1 if len(self.column) else 0
+    def variance(self, of_drives: Float[Tensor, "drives c c"]) -> Float[Tensor, "q m"]:
+        """Of each, out of the covariances that each drive's changes have together, column by column."""
+        by_column = of_drives.diagonal(dim1=-2, dim2=-1).unflatten(1, (self.columns, -1))
+        return by_column[self.whose, self.column]
 
 
 @runtime_checkable
@@ -267,7 +275,7 @@ class MapEquations(NormalEquations, Protocol):
         ...
 
     def variance_of_changes(self, changes: ChainChanges) -> Float[Tensor, "q m"]:
-        """Variances of changes along chains, landmarks and border known."""
+        """Variances of changes along drives, nothing else known, by the last factors."""
         ...
 
     def variance_of_leaves(self) -> Float[Tensor, "l k"]:

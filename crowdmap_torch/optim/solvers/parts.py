@@ -99,18 +99,6 @@ class Part:
         rest[self.place] = right_side
         return solve_rounds(self.rounds, leads, rest)
 
-    def solve_chains(
-        self, leads: Sequence[KeptLead], right_side: Float[Tensor, "m k c"]
-    ) -> Float[Tensor, "m k c"]:
-        """The same of its chains' blocks alone, the leaves marginalised."""
-        # Leaves are the first round, if there are any.
-        begun = int(self.leaf_count > 0)
-        gone = self.rounds[0].place.stop if begun else 0
-        place = self.place[self.leaf_count :] - gone
-        rest = right_side.new_zeros(len(self.at_place) - gone, *right_side.shape[1:])
-        rest[place] = right_side
-        return solve_rounds(self.rounds[begun:], leads[begun:], rest)[place]
-
     def with_couplings(
         self,
         couplings: Mapping[str, Coupling],

@@ -74,10 +74,14 @@ class TiledCholesky:
         return x.view(-1, right_side.shape[1])[: pattern.dim].contiguous()
 
     def whitened(self, right_side: Float[Tensor, "r c"]) -> Float[Tensor, "p c"]:
-        """U^-T times right-hand sides, of which products are those with the inverse; where they are zero costs nothing."""
+        """U^-T times right-hand sides, of which products are those with the inverse.
+
+        Where they are zero costs nothing on a CPU; a GPU would have to stop to be asked.
+        """
         x = self._begun(right_side)
+        asks = x.device.type == "cpu"
         for k, right in enumerate(self.upper.pattern.columns):
-            if bool(x[k].any()):
+            if not asks or bool(x[k].any()):
                 self._forward(x, k, right)
         return x.flatten(0, 1)
 

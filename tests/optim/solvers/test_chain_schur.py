@@ -403,22 +403,30 @@ def covariance_of(
 
 @pytest.mark.parametrize("leaves", [False, True])
 @pytest.mark.parametrize("parts", [1, 2])
-def test_changes_along_chains_vary_as_the_dense_inverse_says(leaves: bool, parts: int):
+@pytest.mark.parametrize("apart", [False, True])
+def test_changes_along_drives_vary_as_the_dense_inverse_says(leaves: bool, parts: int, apart: bool):
     built, values, chain = problem([12, 7])
-    plan, eliminated = EliminationPlan("pose", chain), ("pose",)
+    plan = EliminationPlan("pose", chain)
     if leaves:
         built, values = on_drift(built, values, chain)
         every = torch.arange(len(chain))
-        plan, eliminated = EliminationPlan("drift", chain, "pose", every), ("drift", "pose")
+        plan = EliminationPlan("drift", chain, "pose", every)
     normal = ChainBackend(in_parts(plan, parts)).assemble(built, values)
     normal.solve(torch.tensor([1e-12], dtype=torch.float64))
-    # The last is between two chains.
-    pair, column = torch.tensor([[0, 5], [12, 15], [5, 11], [3, 14]]), torch.tensor([0, 0, 1, 2])
+    # The last is between two chains, of one drive if they are not apart.
+    pair = torch.tensor([[0, 5], [12, 15], [5, 11], [3, 14]])
+    column = torch.tensor([0, 0, 1, 2] if apart else [0, 3, 1, 2])
     # The numbers of a block, and the first less the last.
     of = torch.cat((torch.eye(3), torch.tensor([[1.0], [0.0], [-1.0]])), dim=1).double()
-    found = normal.variance_of_changes(ChainChanges(pair, column, of))
+    drive = torch.tensor([0, 1]) if apart else torch.zeros(2, dtype=torch.long)
+    pair = pair[: 3 if apart else 4]
+    whose = drive[chain[pair[:, 0]]]
+    changes = ChainChanges(pair, column[: len(pair)], 4, whose, of, drive, 3)
+    found = normal.variance_of_changes(changes)
     n = len(chain)
-    P = covariance_of(built, values, *eliminated)[: 3 * n, : 3 * n].view(n, 3, n, 3)
+    dense = DenseBackend().assemble(built, values)
+    at = (dense.where.offset[plan.chains][:, None] + torch.arange(3)).flatten()
+    P = torch.linalg.inv(dense.hessian[0])[at[:, None], at].view(n, 3, n, 3)
     for k, (a, b) in enumerate(pair.tolist()):
         change = P[a, :, a] + P[b, :, b] - P[a, :, b] - P[b, :, a]
         expected = (of.T @ change @ of).diagonal()

@@ -7,7 +7,6 @@ import torch
 
 from crowdmap_torch.optim.solvers import joints as joints_module
 from crowdmap_torch.optim.solvers.joints import JointChain, Joints
-from crowdmap_torch.optim.solvers.normal_equations import ChainChanges
 
 
 def joined(chains: int, blocks: int, width: int = 2) -> tuple[Joints, torch.Tensor, torch.Tensor]:
@@ -50,30 +49,13 @@ def between(
 
 
 @pytest.mark.parametrize("lot", [5, 1 << 12])
-def test_blocks_and_changes_are_those_of_their_chains_joints(
-    lot: int, monkeypatch: pytest.MonkeyPatch
-):
+def test_blocks_are_those_of_their_chains_joints(lot: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(joints_module, "_AT_ONCE", lot)
     joints, diagonal, link = joined(chains=4, blocks=12)
     found = joints.of_blocks(torch.arange(24))
     for k, U in enumerate(joints.goes_with):
         expected = U @ between(joints, diagonal, link, k, k) @ U.T
         assert torch.allclose(found[k], expected, rtol=1e-12, atol=1e-12)
-    pair = torch.tensor([[0, 11], [5, 6], [23, 12], [14, 15]])
-    of = torch.eye(3, dtype=torch.double)[:, :2]
-    changes = ChainChanges(pair=pair, of=of, column=torch.zeros(4, dtype=torch.long))
-    found = joints.of_changes(changes, 0)
-    for row, (a, b) in enumerate(pair.tolist()):
-        u, v = joints.goes_with[a].T @ of, joints.goes_with[b].T @ of
-        both = torch.cat((-u, v))
-        upper = torch.cat(
-            (between(joints, diagonal, link, a, a), between(joints, diagonal, link, a, b)), dim=1
-        )
-        lower = torch.cat(
-            (between(joints, diagonal, link, b, a), between(joints, diagonal, link, b, b)), dim=1
-        )
-        whole = both.T @ torch.cat((upper, lower)) @ both
-        assert torch.allclose(found[row], whole.diagonal(), rtol=1e-12, atol=1e-12)
 
 
 def test_a_drive_of_many_joints_and_blocks_takes_the_memory_of_its_blocks():
