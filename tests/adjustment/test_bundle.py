@@ -97,11 +97,7 @@ def test_what_is_known_of_poses_is_found_anew_when_scales_or_judgements_have_cha
 
 @pytest.mark.parametrize(("few", "near"), [(False, 1.0), (True, _NEAR)])
 def test_scales_that_move_no_landmark_keep_no_adjustment_going(
-    tiny: Dataset,
-    tiny_result: MapResult,
-    monkeypatch: pytest.MonkeyPatch,
-    few: bool,
-    near: float,
+    tiny: Dataset, tiny_result: MapResult, monkeypatch: pytest.MonkeyPatch, few: bool, near: float
 ):
     # Of fewer frames lane points that are followed for ever slide along their markers, a millimetre a step.
     build = builder(tiny, tiny_result, 5.0)
