@@ -94,10 +94,9 @@ def share_told(
 
     `variance` is what is left of each change: of one that nothing tells of, the prior's own.
     """
-    journey = prior.nodes.journey[changes.pair[:, 0]]
-    of_each = scale[:, 1:3].repeat_interleave(3, dim=1)[journey].square()
+    of_each = scale[:, 1:3].repeat_interleave(3, dim=1)[changes.whose].square()
     share = 1 - variance / (of_each * prior.expected_changes(changes.pair))
-    return _by_journey(share.clamp(0, 1), journey, len(scale))
+    return _by_journey(share.clamp(0, 1), changes.whose, len(scale))
 
 
 def _wander_told(
@@ -108,10 +107,9 @@ def _wander_told(
 ) -> Float[Tensor, "j 3"]:
     """The same of the changes of a bias that wanders."""
     assert prior.wander is not None
-    journey = prior.nodes.journey[changes.pair[:, 0]]
     expected = prior.wander.expected_changes(changes.pair, prior.nodes.way, prior.nodes.journey)
-    share = 1 - variance / (scale[journey, 3:].square() * expected)
-    return _by_journey(share.clamp(0, 1), journey, len(scale))
+    share = 1 - variance / (scale[changes.whose, 3:].square() * expected)
+    return _by_journey(share.clamp(0, 1), changes.whose, len(scale))
 
 
 def _by_journey(

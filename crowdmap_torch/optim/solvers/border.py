@@ -31,7 +31,7 @@ from crowdmap_torch.processes.threads import in_order
 
 _NUMBERS = 1 << 20
 """Numbers of right-hand sides that are solved for at once on a CPU."""
-_COLUMNS = 256
+COLUMNS_AT_ONCE = 256
 """Functions of what stays that are solved for at once; bounds the memory."""
 PartWeights = Callable[[int, Part], Tensor]
 """What the blocks of a part, by its number, count in sums over chains: [n, k, m], in their order, leaves first."""
@@ -186,7 +186,7 @@ class WeightedSums:
     def variance(self, factor: TiledCholesky, count: int) -> Float[Tensor, "sums m m"]:
         """What they vary by as what stays does, by the factors of its system."""
         m, dim = self.value.shape[1], factor.upper.pattern.dim
-        found, each = self.value.new_zeros(count, m, m), max(_COLUMNS // max(m, 1), 1)
+        found, each = self.value.new_zeros(count, m, m), max(COLUMNS_AT_ONCE // max(m, 1), 1)
         for begin in range(0, count, each):
             end = min(begin + each, count)
             functions = self.functions(begin, end, dim).flatten(1)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from crowdmap_torch.optim.solvers.border import Sums
+from crowdmap_torch.optim.solvers.border import COLUMNS_AT_ONCE, Sums
 from crowdmap_torch.optim.solvers.layout import Layout, read_entries
 from crowdmap_torch.optim.solvers.normal_equations import LinearFunctions
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix
@@ -18,8 +18,6 @@ from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
 from crowdmap_torch.processes.at_rest import rest
 
 SumsOfChains = Callable[[Tensor, Tensor, int], Sums | None]
-_COLUMNS = 256
-"""Functions whose joint covariance is solved for at once; bounds the memory."""
 
 
 class LandmarkCovariance:
@@ -109,7 +107,7 @@ class LandmarkCovariance:
         at, J = read_entries(functions, self.where)
         n, m, _ = J.shape
         joint = J.new_zeros(n, m, n, m)
-        for rows in torch.arange(n, device=at.device).split(max(_COLUMNS // m, 1)):
+        for rows in torch.arange(n, device=at.device).split(max(COLUMNS_AT_ONCE // m, 1)):
             number = torch.arange(len(rows) * m, device=at.device).view(-1, m, 1)
             function = J.new_zeros(self.where.dim, len(rows) * m)
             entry = at[rows][:, None].expand_as(J[rows])
