@@ -46,7 +46,7 @@ class CompleteTracksConfig(Settings):
     """... if its sides differ by no more than this share."""
     duplicate_m: Length = 1.5
     """A sign this close to one that more journeys saw is a duplicate, if `vote_majority` of its detections lie on the
-    other's projection and nothing else in their frames shows the other [m]."""
+    other's projection, as near as images of the drive are noisy, and nothing else in their frames shows the other [m]."""
     passes: Rounds = 2
     """What was found tells how the projections of other detections err."""
     evidence: Count = 3

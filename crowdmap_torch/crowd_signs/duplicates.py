@@ -25,6 +25,7 @@ from crowdmap_torch.clustering.neighbours import near_pairs
 from crowdmap_torch.crowd_signs.company import CompanyConfig
 from crowdmap_torch.crowd_signs.completion import CompleteTracksConfig
 from crowdmap_torch.crowd_signs.distance import SimilarityConfig, appearance_distance, sign_distance
+from crowdmap_torch.crowd_signs.evidence import reach_of_noise
 from crowdmap_torch.crowd_signs.merge import mutual_partners
 from crowdmap_torch.crowd_signs.projections import candidates_of, misfit_px, projection_errors
 from crowdmap_torch.geometry import se3
@@ -92,7 +93,9 @@ def duplicate_signs(
             journey, pose, signs, association, pairs, window_s=config.error_window_s
         )
         misfit, _ = misfit_px(journey.signs, signs, pairs, error.offset_px)
-        inside = (misfit < config.vote_share * pairs.size) & ~error.is_shown
+        limit = torch.where(error.is_known, reach_of_noise(pairs, error, config), 0.0)
+        limit = torch.maximum(limit, config.vote_share * pairs.size)
+        inside = (misfit < limit) & ~error.is_shown
         fits.append(torch.stack((association.sign[pairs.row], pairs.sign), dim=1)[inside])
     weaker, stronger, number = distinct_pairs(*torch.cat(fits).T)
     alike = number >= config.vote_majority * total[weaker]

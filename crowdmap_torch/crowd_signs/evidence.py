@@ -69,6 +69,17 @@ def shown_by_trusted(
     return used, shown[used], journey[used]
 
 
+def reach_of_noise(
+    pairs: Candidates, error: ProjectionErrors, config: CompleteTracksConfig
+) -> Float[Tensor, " p"]:
+    """How far [px] most corners of a detection may be off its sign where it is known how projections err.
+
+    Where images are noisy most are farther off than `known_px`.
+    """
+    known_px = (_USUAL * error.usual_px).clamp_min(config.known_px)
+    return known_px + config.known_share * pairs.size
+
+
 def tracklet_votes(
     tracklets: Tracklets,
     pairs: Candidates,
@@ -78,10 +89,8 @@ def tracklet_votes(
     config: CompleteTracksConfig,
 ) -> Int[Tensor, " d"]:
     """The sign that most detections of a tracklet lie on, for those that do; -1 for the others."""
-    # Where images are noisy most are farther off than `known_px`.
-    known_px = (_USUAL * error.usual_px).clamp_min(config.known_px)
     limit = config.vote_share * pairs.size
-    limit = torch.where(error.is_known, known_px + config.known_share * pairs.size, limit)
+    limit = torch.where(error.is_known, reach_of_noise(pairs, error, config), limit)
     best, sign = cheapest(pairs.row, pairs.sign, misfit, rows)
     other = pairs.sign != sign[pairs.row]
     second, _ = cheapest(pairs.row[other], pairs.sign[other], misfit[other], rows)

@@ -223,6 +223,33 @@ def test_a_badly_placed_duplicate_is_found_by_what_its_detections_show(drive: Si
     assert torch.equal(kept[1].sign, torch.where(drive.sign == 2, -1, drive.sign))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_duplicate_is_found_where_images_are_noisy(seed: int):
+    """Outlines of 10 to 20 px that are off by 6: every third one of a sign was taken for another one, 3 m behind it."""
+    drive = drive_past(straight_poses(80), signs_at([(4.0, 90.0, 3.0)]), noise_px=6.0, seed=seed)
+    rays = drive.journey.T_world_camera[drive.journey.signs.frame, :3, 3]
+    drive = with_rows(
+        drive, torch.nonzero((rays - drive.T_world_sign[0, :3, 3]).norm(dim=1) > 50)[:, 0]
+    )
+    taken, config = (
+        (torch.arange(len(drive.sign)) % 3 == 0).long(),
+        replace(CONFIG, duplicate_m=5.0),
+    )
+    signs = replace(
+        map_of(drive)[torch.tensor([0, 0])],
+        T_world_sign=torch.cat((drive.T_world_sign, signs_at([(4.0, 93.0, 3.0)]))),
+        n_journeys=torch.tensor([2, 1]),
+    )
+    journeys, poses, associations = two_journeys(replace(drive, sign=0 * taken), taken)
+    found = duplicate_signs(journeys, poses, signs, associations, config)
+    assert found.tolist() == [False, True]
+    # Two of which every frame shows each are two.
+    twice = with_rows(drive, torch.arange(len(drive.sign)).repeat_interleave(2))
+    both = torch.arange(len(twice.sign)) % 2
+    journeys, poses, associations = two_journeys(replace(twice, sign=0 * both), both)
+    assert not duplicate_signs(journeys, poses, signs, associations, config).any()
+
+
 def test_signs_on_one_post_are_no_duplicates(drive: SignDrive):
     journeys, poses, associations = two_journeys(drive, drive.sign)
     for views in ([2, 1, 2], [1, 2, 2], [1, 1, 1]):
