@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from crowdmap_torch.clustering.groups import group_argmin
+from crowdmap_torch.clustering.neighbours import layered
 from crowdmap_torch.evaluation.polyline import Samples
 from crowdmap_torch.evaluation.statistics import PositionFigures, position_figures
 from crowdmap_torch.geometry import polygon, se3
@@ -91,15 +93,18 @@ def seen_by_journeys(truth: Truth, samples: Samples) -> Int[Tensor, " p"]:
     the true pose.
     """
     journeys = torch.zeros_like(samples.line)
+    if not len(samples):
+        return journeys
+    markers = KDTree(_on_markers(samples.point_world, samples.line))
     for journey in truth.journeys:
-        journeys += _seen_by(journey, samples)
+        journeys += _seen_by(journey, samples, markers)
     return journeys
 
 
-def _seen_by(truth: JourneyTruth, samples: Samples) -> Bool[Tensor, " p"]:
+def _seen_by(truth: JourneyTruth, samples: Samples, markers: KDTree) -> Bool[Tensor, " p"]:
     detections, points = truth.journey.lanes, truth.journey.lane_points
     nothing = torch.zeros_like(samples.line, dtype=torch.bool)
-    if len(points) == 0 or len(samples) == 0:
+    if len(points) == 0:
         return nothing
     lane = truth.lane[detections.row]
     frame = detections.frame[points.detection]
@@ -117,7 +122,7 @@ def _seen_by(truth: JourneyTruth, samples: Samples) -> Bool[Tensor, " p"]:
     for row in ends:
         row = row[both]
         point = se3.transform(truth.T_world_camera[frame[row]], ray[row] * depth[row][:, None])
-        place.append(_nearest_sample(point, lane[both], samples))
+        place.append(_nearest_sample(point, lane[both], markers))
     known = (place[0] >= 0) & (place[1] >= 0)
     low = torch.minimum(place[0], place[1])[known]
     high = torch.maximum(place[0], place[1])[known]
@@ -138,16 +143,17 @@ def _row_of_extreme(
 
 
 def _nearest_sample(
-    point_world: Float[Tensor, "n 3"], lane: Int[Tensor, " n"], samples: Samples
+    point_world: Float[Tensor, "n 3"], lane: Int[Tensor, " n"], markers: KDTree
 ) -> Int[Tensor, " n"]:
     """The horizontally nearest sample of its own marker to each point; -1 if none is near."""
-    # Markers far apart in a third coordinate: the tree then answers for each point's own marker
-    # only.
-    apart = 1e6
-    keys = [
-        torch.cat((p[:, :2], apart * k[:, None].to(p)), dim=-1).cpu().numpy()
-        for p, k in ((samples.point_world, samples.line), (point_world, lane))
-    ]
-    distance, index = KDTree(keys[0]).query(keys[1], distance_upper_bound=_BESIDE_M)
+    of_own = _on_markers(point_world, lane)
+    distance, index = markers.query(of_own, distance_upper_bound=_BESIDE_M)
     found = torch.as_tensor(index).to(lane)
     return torch.where(torch.as_tensor(distance).to(point_world).isfinite(), found, -1)
+
+
+def _on_markers(
+    point_world: Float[Tensor, "n 3"], lane: Int[Tensor, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """East and north, the markers out of each other's reach: a tree answers for each point's own one."""
+    return layered(point_world[:, :2], lane, _BESIDE_M).cpu().numpy()

@@ -160,9 +160,8 @@ def _map_columns(prefix: str, hd_map: HdMap) -> Iterator[tuple[str, Column]]:
     yield f"{prefix}sign.covariance", column(upper, 0)
     point, sigma, count = [], [], []
     samples = lane_samples(lanes, _LANE_STEP_M)
-    for number in range(len(lanes)):
-        mine = samples.line == number
-        line, of_line = samples.point_world[mine].numpy(), samples.sigma[mine].numpy()
+    for mine in _rows_by_line(samples.line.numpy(), len(lanes)):
+        line, of_line = samples.point_world.numpy()[mine], samples.sigma.numpy()[mine]
         kept = simplified(line, LINE_TOLERANCE_M)
         point.append(line[kept])
         sigma.append(of_line[kept])
@@ -198,7 +197,7 @@ def _survey_columns(survey: Survey) -> Iterator[tuple[str, Column]]:
     away = (signs.corners_world - signs.center_world[:, None]).nan_to_num(0.0)
     yield "survey.corner", column(away, PLACE_STEP_M)
     lane, point = survey.lane_points.lane.numpy(), survey.lane_points.point_world.numpy()
-    lines = [point[lane == number] for number in range(len(survey.lane_id))]
+    lines = (point[mine] for mine in _rows_by_line(lane, len(survey.lane_id)))
     lines = [line[simplified(line, LINE_TOLERANCE_M)] for line in lines]
     yield "survey.lane.type", column(survey.lane_type)
     yield "survey.lane.count", column(np.array([len(line) for line in lines], dtype=int))
@@ -226,6 +225,12 @@ def _drive_columns(drives: Sequence[Drive], tolerance: float) -> Iterator[tuple[
         if any(len(line) for line in lines):
             yield f"{name}.count", column(np.array([len(line) for line in lines], dtype=int))
             yield f"{name}.point", column(_stacked(lines), PATH_STEP_M, "rows")
+
+
+def _rows_by_line(line: np.ndarray, lines: int) -> list[np.ndarray]:
+    """The rows of each of so many lines, in their order."""
+    ends = np.bincount(line, minlength=lines).cumsum()
+    return np.split(np.argsort(line, kind="stable"), ends[:-1])
 
 
 def _stacked(lines: Sequence[np.ndarray]) -> np.ndarray:
