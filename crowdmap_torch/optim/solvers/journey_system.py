@@ -51,8 +51,12 @@ from crowdmap_torch.optim.solvers.normal_equations import (
 from crowdmap_torch.optim.solvers.plan import EliminationPlan
 from crowdmap_torch.optim.solvers.sparse_tiles import TileMatrix, TilePattern
 from crowdmap_torch.optim.solvers.tiled_cholesky import TiledCholesky
+from crowdmap_torch.processes.memory import give_back
 from crowdmap_torch.processes.sums import add_at
 from crowdmap_torch.processes.together import Together
+
+_AT_ONCE = 1 << 20
+"""Numbers of a summand that are added at once: where all of them go to takes three times their own memory."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +117,10 @@ class JourneySystem:
         area, of_row = pattern.width**2, self.tile[:, 0] * pattern.tiles + self.tile[:, 1]
         begin = pattern.base[: pattern.tiles, : pattern.tiles].flatten()[of_row]
         assert bool((begin >= 0).all()), "the sum has the tiles of its summands"
-        entry = self.entry.long()
-        add_at(system.flat, 0, begin[entry // area] + entry % area, self.information)
+        for of in range(0, len(self.entry), _AT_ONCE):
+            entry = self.entry[of : of + _AT_ONCE].long()
+            place = begin[entry // area] + entry % area
+            add_at(system.flat, 0, place, self.information[of : of + _AT_ONCE])
         padded = system.flat[pattern.count * area :][: pattern.tiles * pattern.width]
         add_at(padded.view(-1, pattern.width), 0, self.row, self.right_side)
 
@@ -187,6 +193,8 @@ class Summed:
         for part in parts:
             assert part.holds_at(values), "systems of one point are added up"
             part.add_to(system)
+            del part
+            give_back()
         system.add_diagonal(added)
         self.factor, self.added = TiledCholesky.of(system), added
         return None if self.factor is None else system.right_side
