@@ -45,6 +45,8 @@ SURE_EPIPOLAR_COST = 5.0
 """Most that the epipolar cost can add where the tracklet is known well enough to be predicted."""
 _LARGE, _RARE = 4.64, 0.2
 """A squared distance from its prediction that a fifth of all sightings exceeds (chi squared, three degrees of freedom)."""
+_ALONG = 8.0
+"""What is so many times nearer to where it was in the image than to where it would be if it stood moves with the car."""
 _STEP = 0.1
 """Of the logarithm of the noise's variance, for one sighting."""
 _SLACK = 0.3
@@ -115,7 +117,12 @@ class SignAssociator(CausalAssociator[ActiveSigns, SignFeatures]):
             cost = self._costs(old, features, rows, *seen, white_sigma_m)
             row, column = gated_matching(cost, self.config.unmatched_cost)
             sure = old.votes[row].sum(-1) >= self.config.sure_after
-            self._learn(innovation.distance_sq[row[sure], column[sure]])
+            last, new = old.last[row[sure]], column[sure]
+            off = innovation.distance_sq[row[sure], new]
+            both = variance[new] + self._noise * features.variance[last]
+            moved = (np.square(sighting[new] - features.sighting[last]) / both).sum(-1)
+            # Plates of cars ahead stay where they are in the image: by them all noise would seem large.
+            self._learn(off[(off <= _LARGE) | (_ALONG * moved >= off)])
 
         label = self._labels(old, row, column, len(rows))
         shift = features.shift[rows]

@@ -100,6 +100,48 @@ def test_noise_is_learnt_from_what_is_seen(seed: int):
     assert int(together.view(-1, 20).amax(1).sum()) > 0.97 * len(label)
 
 
+def winding_poses(frames: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """A level drive that turns by 29 degrees to either side within 186 m, and its headings [rad]."""
+    way = 0.8 * torch.arange(frames, dtype=F64)
+    heading = 0.5 * torch.sin(2 * torch.pi * way / 186.0)
+    turn = torch.zeros(frames, 6, dtype=F64)
+    turn[:, 5] = heading
+    poses = straight_poses(frames)
+    poses[:, :3, :3] = se3.exp(turn)[:, :3, :3] @ poses[:, :3, :3]
+    step = 0.8 * torch.stack((-heading.sin(), heading.cos()), dim=1)
+    poses[:, :2, 3] = step.cumsum(0) - step[:1]
+    return poses, heading
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_goes_along_with_the_car_teaches_no_noise(seed: int):
+    """The plate of a car ahead in bends, where it is in every image: noise of a hundred times the variance was learnt."""
+    poses, heading = winding_poses(300)
+    at = torch.arange(40, 280, 50)
+    beside = 4.0 * torch.stack((heading[at].cos(), heading[at].sin()), dim=1)
+    places = torch.nn.functional.pad(poses[at, :2, 3] + beside, (0, 1), value=2.5)
+    facing = torch.rad2deg(heading[at]).tolist()
+    drive = drive_past(poses, signs_at(places, yaw_deg=facing), noise_px=0.8, seed=seed)
+    seen, plates = len(drive.sign), torch.zeros(300, dtype=torch.long)
+    drive = with_rows(drive, torch.cat((torch.arange(seen), plates)))
+    frame, px = drive.journey.signs.frame.clone(), drive.journey.signs.corners_px.clone()
+    outline = torch.tensor([[270.0, 97], [330, 97], [330, 143], [270, 143]], dtype=F64)
+    generator = torch.Generator().manual_seed(seed)
+    px[seen:, :4] = outline + 0.8 * torch.randn(300, 4, 2, generator=generator, dtype=F64)
+    px[seen:, 4:] = px[seen:, 3:4]
+    frame[seen:] = torch.arange(300)
+    drive = with_signs(drive, frame=frame, corners_px=px)
+    drive = moved_corners(drive, torch.arange(len(frame)), (0.0, 0.0))
+    signs, associator, noise = drive.journey.signs, SignAssociator(NOISE, CONFIG), []
+    label = torch.full_like(drive.sign, -1)
+    for number, pose in enumerate(noisy_poses(poses)):
+        now = (signs.frame == number).nonzero()[:, 0]
+        label[now], _ = associator.step(number, pose, signs[now])
+        noise.append(associator.state_dict()["log_noise"])
+    assert max(noise) < 0.5
+    assert_one_tracklet_each(label[:seen], drive.sign[:seen])
+
+
 @pytest.mark.parametrize("seeds", [(0, 1, 2), (3, 4, 5)])
 def test_tracklets_stay_whole_where_positions_tremble(seeds: tuple[int, ...]):
     """Five frames a second on a motorway, of which a third is missed; as configured, positions are good to 2 cm."""
