@@ -42,7 +42,8 @@ class DuplicateSignConfig(Settings):
     merge_cost: Cost = 9.0
     """Signs of one shape whose codes do not contradict each other are one if they are closer than this, ..."""
     max_distance_m: Length = 1.5
-    """... no further apart than this, and no drive saw both in one frame."""
+    """... no further apart than this, and no drive saw both in one frame. If it saw them in turn they are as much closer as
+    it is unlikely that two signs were never in sight together."""
     overlap: Share = 0.35
     """Closer than this share of the smaller side, they are one plate detected twice, whoever saw both; and if one drive did,
     whatever their codes: no sign was put in the place of another meanwhile."""
@@ -172,6 +173,8 @@ def same_sign(
     sigma = signs.size.new_full((3,), config.least_sigma_m)
     cost = sign_distance(signs, signs, pair, config.similarity, sigma)
     overlaps = _overlap(signs, pair, config) & cost.isfinite()
+    # So many frames with both were to be expected, and there is none: exp(-n), in squared standard deviations.
+    cost = cost - 2 * seen_in_turn(journeys, associations, pair)
     together = seen_together(journeys, associations, len(signs))
     while True:
         # Of two groups every pair must agree: what was seen beside one of them is neither.
@@ -232,6 +235,35 @@ def seen_together(
     pair = torch.cat(found)
     key = torch.unique(pair[:, 0] * count + pair[:, 1])
     return torch.stack((key // max(count, 1), key % max(count, 1)), dim=1)
+
+
+def seen_in_turn(
+    journeys: Sequence[Journey], associations: Sequence[Association], pair: Int[Tensor, "p 2"]
+) -> Float[Tensor, " p"]:
+    """In how many frames drives would have seen both signs of each pair, had they seen either for reasons of its own.
+
+    Counted are the frames of a drive from where it had seen both once until it did not see one of them any more.
+    """
+    expected = torch.zeros(len(pair), dtype=torch.float64, device=pair.device)
+    for journey, association in zip(journeys, associations, strict=True):
+        shown = association.sign >= 0
+        sign, frame, _ = distinct_pairs(association.sign[shown], journey.signs.frame[shown])
+        if not len(sign):
+            continue
+        span = journey.frame_count + 1
+        key = sign * span + frame
+        begin, end = (torch.searchsorted(key, (pair + k) * span) for k in (0, 1))
+        is_seen = (begin < end).all(1)
+        low = frame[begin.clamp_max(len(frame) - 1)].amax(1)
+        high = frame[(end - 1).clamp_min(0)].amin(1)
+        of_each = [
+            torch.searchsorted(key, pair * span + bound[:, None], right=right)
+            for bound, right in ((low, False), (high, True))
+        ]
+        number = (of_each[1] - of_each[0]).to(expected).prod(1)
+        both = number / (high - low + 1).clamp_min(1)
+        expected += torch.where(is_seen & (low <= high), both, 0.0)
+    return expected
 
 
 def _told_apart(

@@ -27,7 +27,12 @@ from crowdmap_torch.crowd_signs.completion import (
     CompletedTracks,
     CompleteTracksConfig,
 )
-from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, may_be_one, seen_together
+from crowdmap_torch.crowd_signs.duplicates import (
+    DuplicateSignConfig,
+    may_be_one,
+    seen_in_turn,
+    seen_together,
+)
 from crowdmap_torch.geometry import polygon, se3
 from crowdmap_torch.tables import Association, Journey, Signs
 
@@ -137,6 +142,44 @@ def test_what_differs_or_is_surely_elsewhere_stays_two(drive: SignDrive) -> None
     assert not is_joined(T_world_sign=away, covariance=0.1 * signs.covariance)
     behind = signs.T_world_sign @ se3.exp(torch.tensor([0, 0, 0, 0, torch.pi, 0.0], dtype=F64))
     assert not is_joined(T_world_sign=torch.where(last[:, None, None], behind, signs.T_world_sign))
+
+
+@pytest.mark.parametrize("seen", ["in turn", "one after the other", "once together"])
+def test_signs_that_a_drive_sees_in_turn_and_never_together_are_one(
+    drive: SignDrive, seen: str
+) -> None:
+    """A metre apart where 0.28 m, 1-sigma, are usual of two: too far for one sign, unless they are seen so."""
+    twice = torch.cat((torch.arange(len(drive.sign)), torch.nonzero(drive.sign == 2)[40:41, 0]))
+    drive = with_rows(drive, twice if seen == "once together" else twice[:-1])
+    frame, copy = drive.journey.signs.frame, len(PLACES)
+    of_copy = frame % 2 == 0
+    if seen == "one after the other":
+        of_copy = frame > frame[drive.sign == 2].median()
+    second = torch.where((drive.sign == 2) & of_copy, copy, drive.sign)
+    if seen == "once together":
+        second[-1] = 2 if second[twice[-1]] == copy else copy
+    journeys, _, associations = two_journeys(drive, second)
+    signs = with_copy(map_of(drive), 2, (0.6, 0.8, 0.0))
+    expected = seen_in_turn(journeys, associations, torch.tensor([[2, copy], [0, copy]]))
+    views = int((drive.sign == 2).sum())
+    if seen == "one after the other":
+        assert float(expected[0]) == 0
+    else:
+        assert 0.2 * views < float(expected[0]) < 0.3 * views
+    # Of those that were seen together it says nothing, and is not asked.
+    assert float(expected[1]) > 10
+    found = join_duplicates(signs, journeys, associations, CONFIG)
+    assert (found is not None) == (seen == "in turn")
+    assert found is None or len(found[0]) == len(PLACES)
+
+
+def test_nobody_sees_in_turn_what_nobody_sees(drive: SignDrive) -> None:
+    none = with_rows(drive, torch.zeros(0, dtype=torch.int64))
+    pair = torch.tensor([[0, 1]])
+    association = associated(none, none.sign >= 0)
+    assert seen_in_turn([none.journey], [association], pair).tolist() == [0.0]
+    known = associated(drive, torch.ones_like(drive.sign, dtype=torch.bool))
+    assert len(seen_in_turn([drive.journey], [known], pair[:0])) == 0
 
 
 def test_plates_that_overlap_are_one_whoever_saw_both(drive: SignDrive) -> None:
