@@ -230,7 +230,7 @@ def _drive_columns(drives: Sequence[Drive], tolerance: float) -> Iterator[tuple[
 def _rows_by_line(line: np.ndarray, lines: int) -> list[np.ndarray]:
     """The rows of each of so many lines, in their order."""
     ends = np.bincount(line, minlength=lines).cumsum()
-    return np.split(np.argsort(line, kind="stable"), ends[:-1])
+    return np.split(np.argsort(line, kind="stable"), ends[:-1])[:lines]
 
 
 def _stacked(lines: Sequence[np.ndarray]) -> np.ndarray:

@@ -51,6 +51,14 @@ def test_markers_come_back_within_a_centimetre(scene: Scene) -> None:
     assert len(found["lane.sigma"]) == count.sum()
 
 
+def test_a_map_without_markers_has_none(scene: Scene) -> None:
+    assert scene.hd_map is not None
+    none = scene.hd_map.lanes.select(torch.zeros(0, dtype=torch.long))
+    bare = replace(scene, hd_map=replace(scene.hd_map, lanes=none, lane_id=()))
+    _, found = unpacked(payload_of(bare))
+    assert len(found["lane.type"]) == len(found["lane.count"]) == len(found["lane.point"]) == 0
+
+
 def test_errors_against_the_survey_are_those_of_the_evaluation(scene: Scene) -> None:
     assert scene.hd_map is not None and scene.survey is not None
     _, found = unpacked(payload_of(scene))
