@@ -32,11 +32,12 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     associate_detections,
     associated_once,
     completed_signs,
+    merged_signs,
     with_company,
     without_strayed,
 )
 from crowdmap_torch.crowd_signs.completion import AssociatedSigns, CompletedTracks
-from crowdmap_torch.crowd_signs.duplicates import may_be_one
+from crowdmap_torch.crowd_signs.duplicates import may_be_one, same_sign
 from crowdmap_torch.crowd_signs.gather import gather_signs, signs_of_crowd
 from crowdmap_torch.crowd_signs.journey_bias import without_bias
 from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
@@ -52,7 +53,6 @@ from crowdmap_torch.optim.levenberg_marquardt import LmState
 from crowdmap_torch.processes.memory import large_tensors_again
 from crowdmap_torch.processes.progress import ProgressCall, silent
 from crowdmap_torch.processes.threads import one_core_each
-from crowdmap_torch.processes.workers import Call
 from crowdmap_torch.road.estimate import estimate_road
 from crowdmap_torch.signs.triangulate import SignReport, triangulate_signs
 from crowdmap_torch.survey.control import find_control_signs
@@ -186,7 +186,7 @@ def map_journeys(
         engine = InProcess()
     tracked = tracklets or {}
     drives = journeys if stored is None or engine.shares_memory else stored
-    calls: list[Call] = [
+    calls = [
         (journeys[n].journey_id, map_journey, (drives[n], n, config, tracked.get(n))) for n in left
     ]
     for place, made in engine.each(calls):
@@ -286,10 +286,7 @@ def build_bundle(
     control: SurveySigns | None = None,
     known_cars: Mapping[str, KnownCalibration] | None = None,
 ) -> Bundle:
-    """Section V-B: the unknowns and observations of bundle adjustment.
-
-    Signs that are in `control` pin the map; of some cars the calibration may be known already, by name.
-    """
+    """Section V-B: unknowns and observations; signs in `control` pin the map, of `known_cars` calibrations are known."""
     config = config.resolved()
     pins = None if control is None else find_control_signs(first.signs, control, config.control)
     return adjust.build(
@@ -345,9 +342,9 @@ def made_anew(
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
     """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: nothing.
 
-    None is what went astray, is another one from afar, or fits too few drives and is none of two that may be one. Markers
-    that are there twice are joined anew, signs of single drives that are one come in while a round is left that can tell
-    whether they fit. With it the covariances, if they had to be known for that: before it has `ended` that can wait.
+    None is what went astray, is another one from afar, or fits too few drives and is none of two that may be one; later on
+    `finish_map` joins those. Markers that are there twice are joined anew, signs of single drives that are one come in while
+    a round can tell whether they fit. With it the covariances, if they had to be known: that can wait until it has `ended`.
     """
     rules = config.duplicate_signs
     if first.completed is None or first.anew >= rules.rounds:
@@ -363,7 +360,7 @@ def made_anew(
     given = journeys, poses, [m.sign_tracklets for m in maps]
     how = rules, config.complete_tracks, sound
     once = without_strayed(*given, found, first.signs, first.drifts, drifts, unseen, pair, *how)
-    if once is None and len(pair) and ended:
+    if once is None and len(pair) and ended and not first.anew:
         known = map_uncertainty(bundle, first.signs, first.lanes, engine)
         found = replace(found, heads=replace(signs, covariance=known.of_their_own))
         once = associated_once(*given, found, *how)
@@ -405,13 +402,18 @@ def finish_map(
 ) -> MapResult:
     """The adjusted map with its covariances, the refined poses, and which landmark each detection shows.
 
-    Covariances that are not known yet are found by the hosts of an engine, of many drives; None: all in this process.
+    Signs that are one by now are joined. Covariances that are not known are found by an engine's hosts, of many drives.
     """
     poses = adjust.read_poses(bundle, journeys := dataset.journeys)
     uncertainty = uncertainty or map_uncertainty(bundle, first.signs, first.lanes, engine)
     bundle.forget_factors()  # As large as all that follows.
     signs, lanes = adjust.read_map(bundle, first.signs, first.lanes, uncertainty)
     associations = first.associations
+    if first.anew:
+        own = replace(signs, covariance=uncertainty.of_their_own)
+        into = same_sign(own, journeys, associations, config.duplicate_signs)
+        signs, associations = merged_signs(signs, associations, into)
+        uncertainty = uncertainty.of_signs(into)
     if first.completed is not None:
         # Once more with the adjusted poses: what the first projections were too far off for.
         given = journeys, poses, [m.sign_tracklets for m in maps]

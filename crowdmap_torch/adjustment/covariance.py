@@ -7,7 +7,7 @@ marginalised, as far as landmarks are bound to each other; what all positions sh
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -66,6 +66,16 @@ class MapUncertainty:
         That is found of some places: along axes where a sign is surer than that, nothing is left.
         """
         return at_least(self.center - self.shared, 0.0)
+
+    def of_signs(self, into: Int[Tensor, " n"]) -> MapUncertainty:
+        """That of the signs that are themselves, where `into` has of each sign which one it is."""
+        own = into == torch.arange(len(into), device=into.device)
+        found = self.influence
+        if found is not None and len(into):
+            far, number = found.farthest_sign, own.cumsum(0) - 1
+            renumbered = torch.where(far < 0, far, number[into[far.clamp_min(0)]])
+            found = replace(found, farthest_sign=renumbered)
+        return replace(self, center=self.center[own], corner=self.corner[own], influence=found)
 
 
 @torch.no_grad()

@@ -220,9 +220,10 @@ def associated_once(
 
     `poses` and the heads are adjusted; the heads' covariances are those of their centres without what all positions share.
     """
-    joined = join_duplicates(before.heads, journeys, before.associations, config)
-    if joined is None:
+    into = same_sign(before.heads, journeys, before.associations, config)
+    if torch.equal(into, torch.arange(len(into), device=into.device)):
         return None
+    joined = merged_signs(before.heads, before.associations, into)
     given = journeys, poses, tracklets, *joined
     return _associated_anew(*given, before.tentative, completion, trusted)
 
@@ -300,17 +301,11 @@ def with_company(
     return replace(more, heads=replace(more.heads, confidence=confidence))
 
 
-def join_duplicates(
-    signs: Signs,
-    journeys: Sequence[Journey],
-    associations: Sequence[Association],
-    config: DuplicateSignConfig,
-) -> tuple[Signs, tuple[Association, ...]] | None:
-    """The signs without those that are another one, and which of them each detection shows; None if all are their own."""
-    into = same_sign(signs, journeys, associations, config)
+def merged_signs(
+    signs: Signs, associations: Sequence[Association], into: Int[Tensor, " n"]
+) -> tuple[Signs, tuple[Association, ...]]:
+    """The signs that are themselves of those that each of them is, and which of them each detection shows."""
     goes = into != torch.arange(len(into), device=into.device)
-    if not bool(goes.any()):
-        return None
     count = polygon.corner_count(signs.shape)
     turn, _ = polygon.best_shift(signs.corners_world[into], signs.corners_world, count)
     moved = tuple(_shown_by(a, into, turn, count) for a in associations)

@@ -38,7 +38,8 @@ class DuplicateSignConfig(Settings):
     """When two signs of an adjusted map are one; costs are squared standard deviations."""
 
     rounds: RoundsOrNone = 2
-    """So many times at most the adjustment begins again with what was joined or found; 0: never."""
+    """So many times at most the adjustment begins again with what was joined or found; 0: never. Signs that are one when it
+    has begun again already are joined as they stand, the one that was seen most often stays."""
     merge_cost: Cost = 9.0
     """Signs of one shape whose codes do not contradict each other are one if they are closer than this, ..."""
     max_distance_m: Length = 1.5

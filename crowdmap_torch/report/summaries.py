@@ -114,7 +114,9 @@ def counts_of(dataset: Dataset, result: MapResult, config: MapperConfig) -> dict
         if first.completed
         else 0,
         "adjustments begun again": first.anew,
-        "signs joined or gone after the adjustment": first.joined,
+        "signs joined or gone after the adjustment": first.joined
+        + len(first.signs)
+        - len(result.uncertainty.center),
         "signs found by adjusted poses": first.found_later,
         "sign detections used": sum(int((a.sign >= 0).sum()) for a in result.associations),
         "lane detections used": sum(int((a.lane >= 0).sum()) for a in result.associations),

@@ -18,11 +18,13 @@ from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig
 from crowdmap_torch.geometry import se3
 from crowdmap_torch.mapper import FirstMap, MapResult, adjusted_map, build_bundle, made_anew
 from crowdmap_torch.noise.positioning import PositioningNoise
+from crowdmap_torch.report.summaries import counts_of
 from crowdmap_torch.tables import Dataset
 
 WANDERING = PositioningNoise(wander_length_m=200.0)
 """As if a drive of this length were a long one."""
 STEADY = PositioningNoise(wander_sigma_m=0.0)
+GONE = "signs joined or gone after the adjustment"
 
 
 def built(
@@ -194,6 +196,25 @@ def test_a_sign_that_was_taken_for_two_is_one_in_the_end(tiny, tiny_result: MapR
     here, there = (of.hd_map.signs.center_world for of in (found, tiny_result))
     assert len(here) == len(there)
     assert float(torch.cdist(there, here).amin(1).max()) < 0.05
+
+
+def test_a_sign_that_is_two_after_another_beginning_is_one_without_a_third(
+    tiny, tiny_result: MapResult
+):
+    first = replace(with_a_split_sign(tiny_result.first), anew=1)
+    found = adjusted_map(tiny, tiny_result.journey_maps, first, MapperConfig())
+    assert found.first.anew == 1
+    signs, right = found.hd_map.signs, tiny_result.hd_map.signs
+    assert len(signs) == len(right)
+    assert counts_of(tiny, found, MapperConfig())[GONE] == 1
+    # It has what all drives saw of it, and is as sure as the one of both that stays.
+    off, same = torch.cdist(right.center_world, signs.center_world).min(1)
+    assert float(off.max()) < 0.05
+    assert torch.equal(signs.n_journeys[same], right.n_journeys)
+    assert torch.equal(signs.n_observations[same], right.n_observations)
+    of_map = len(first.signs) - 1
+    assert torch.equal(found.uncertainty.center, signs.covariance[:of_map])
+    assert len(found.uncertainty.corner) == of_map
 
 
 def test_markers_that_were_taken_for_two_are_one_in_the_end(tiny, tiny_result: MapResult):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -111,6 +112,26 @@ def test_figures_are_those_of_the_moves(bundle, whole, street, every):
         seen = whole.of_drives[drive].block["lane"]
         both = across[seen[torch.isin(seen, torch.cat(others))]]
         assert float(found.across_m[drive]) == pytest.approx(float(both.square().mean().sqrt()))
+
+
+def test_of_signs_that_went_into_others_the_farthest_is_the_one_that_stays(street, bundle, every):
+    known = map_uncertainty(bundle, street.signs, street.lanes)
+    known = replace(known, influence=influence(bundle, known.center))
+    last = len(known.center) - 1
+    into = torch.arange(last + 1)
+    into[[0, last]] = torch.tensor([1, 1])
+    assert known.influence is not None
+    far = known.influence.farthest_sign.clone()
+    far[:3] = torch.tensor([0, last, -1])
+    known = replace(known, influence=replace(known.influence, farthest_sign=far))
+    left = known.of_signs(into)
+    assert torch.equal(left.center, known.center[1:last])
+    assert torch.equal(left.corner, known.corner[1:last])
+    assert left.influence is not None
+    assert left.influence.farthest_sign[:3].tolist() == [0, 0, -1]
+    rest = far[3:]
+    stays = torch.where((rest == 0) | (rest == last), 0, rest - 1)
+    assert torch.equal(left.influence.farthest_sign[3:], stays)
 
 
 def test_who_has_no_say_has_no_influence(street, every):

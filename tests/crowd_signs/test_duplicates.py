@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -21,7 +22,7 @@ from worlds.sign_drive import (
     with_rows,
 )
 
-from crowdmap_torch.crowd_signs.complete_tracks import join_duplicates, without_strayed
+from crowdmap_torch.crowd_signs.complete_tracks import merged_signs, without_strayed
 from crowdmap_torch.crowd_signs.completion import (
     AssociatedSigns,
     CompletedTracks,
@@ -30,6 +31,7 @@ from crowdmap_torch.crowd_signs.completion import (
 from crowdmap_torch.crowd_signs.duplicates import (
     DuplicateSignConfig,
     may_be_one,
+    same_sign,
     seen_in_turn,
     seen_together,
 )
@@ -64,6 +66,19 @@ def split(
     journeys, _, associations = two_journeys(drive, second)
     signs = with_copy(map_of(drive), row, (0.05, 0.1, -0.03))
     return signs, journeys, associations, associations[0]
+
+
+def join_duplicates(
+    signs: Signs,
+    journeys: Sequence[Journey],
+    associations: Sequence[Association],
+    config: DuplicateSignConfig,
+) -> tuple[Signs, tuple[Association, ...]] | None:
+    """The signs that are themselves, and which of them each detection shows; None if all are."""
+    into = same_sign(signs, journeys, associations, config)
+    if torch.equal(into, torch.arange(len(into))):
+        return None
+    return merged_signs(signs, associations, into)
 
 
 @pytest.mark.parametrize("row", [0, 1, 2])
