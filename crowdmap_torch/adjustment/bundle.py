@@ -20,7 +20,12 @@ from crowdmap_torch.adjustment.noise_pull import held_off, left_by_prior, noise_
 from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.adjustment.parts import Observations, Priors, SharedOut, Unknowns
 from crowdmap_torch.adjustment.pixel_scales import PixelErrors, pixel_scales
-from crowdmap_torch.adjustment.shared_corner_errors import Lasting, lasting_errors, shared_errors
+from crowdmap_torch.adjustment.shared_corner_errors import (
+    Followed,
+    Lasting,
+    lasting_errors,
+    shared_errors,
+)
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.noise.pose_evidence import PoseEvidence, pose_evidence, white_scales
 from crowdmap_torch.noise.pose_prior import WANDER_SCALE
@@ -64,8 +69,6 @@ _WHITE_RESTS = 0.03
 """A scale of the poses' noise from frame to frame that would change by less than this share is at rest."""
 _FEW = 0.1
 """Detections are first judged when the scales of all but this share of the drives are at rest; once more when all are."""
-_SHARE_RESTS = 0.2
-"""The share of poses' errors that is there is at rest where it changes by less than this: by as much of a small pull."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +159,7 @@ class Bundle(BundleState):
         everything, and fall as the fit improves; they never grow again. What detections of a sign have wrong together is
         told from zero on once that of corners is at rest: before that it is the drift. Those of the poses' prior follow the
         drift and the noise about it, as far as there is `evidence` of them, those of calibrations what `of_border` tells
-        of cars.
+        of cars; while detections are unjudged none of these does.
         """
         values, made_with = self.values(), self.scales()
         if len(self.lane_points):
@@ -178,6 +181,9 @@ class Bundle(BundleState):
             self.held_off.copy_(evidence.held_off)
             self.innovation.copy_(evidence.innovation)
         judging, at_rest = self._narrow(values, foreseen)
+        self.refreshed.fill_(True)
+        if bool(self.unjudged.any()):
+            return AtRest(at_rest and judging, judging)
         creeps: list[Tensor] = []
         if evidence is not None:
             creeps.append(self._rescale_noise(values, evidence))
@@ -196,7 +202,6 @@ class Bundle(BundleState):
         moved[:, WANDER_SCALE:] *= _SCALE_RESTS / _WANDER_RESTS
         creeps.append(moved[:, :WANDER_SCALE])
         creep = float((torch.cat(creeps, dim=1) > 1).any(1).double().mean())
-        self.refreshed.fill_(True)
         rest = at_rest and judging and creep == 0 and not bool((moved > 1).any())
         return AtRest(rest, judging and creep <= _FEW + 1e-6)
 
@@ -293,10 +298,11 @@ class Bundle(BundleState):
         corners, *lanes = narrows.tolist()
         if corners or not foreseen or self.config.method == "paper2017":
             return not corners, not any(lanes)
-        now, share, rests = self.together.of_all(self._seen_lasting, of_corners, self.innovation)
-        self.lasting.copy_(now.of_many)
-        self.lasting_each.copy_(now.of_each)
-        self.share_there.copy_(share)
+        now, rests = self.together.of_all(self._seen_lasting, of_corners, self.innovation)
+        self.lasting.copy_(now.lasting.of_many)
+        self.lasting_each.copy_(now.lasting.of_each)
+        self.share_there.copy_(now.share)
+        self.strides.copy_(now.stride)
         lasting_rests, share_rests = rests.tolist()
         return lasting_rests, share_rests and not any(lanes)
 
@@ -314,14 +320,15 @@ class Bundle(BundleState):
 
     def _seen_lasting(
         self, of_corners: Float[Tensor, "m 2"], innovation: Float[Tensor, "d 3"]
-    ) -> tuple[Lasting, Float[Tensor, ""], Bool[Tensor, " 2"]]:
+    ) -> tuple[Followed, Bool[Tensor, " 2"]]:
         """What lasts of shifts and of sizes by the errors of all, what share of poses' is there, and whether both rest.
 
-        From the second time on shifts and that share go half of the way to where they are found, by what they were.
+        From the second time on shifts and that share go half of the way to where they are found, or less, by what they were.
         """
-        before = Lasting(self.lasting, self.lasting_each)
+        lasting = Lasting(self.lasting, self.lasting_each)
+        before = Followed(lasting, self.share_there, self.strides)
         if not len(of_corners):
-            return before, self.share_there, self.given_up.new_ones(2)
+            return before, self.given_up.new_ones(2)
         rows, detections = self.whole.corners, self.whole.detections
         # Corners of boxes tell little of it, and would hide that of outlines; the centre of a box counts.
         # Among those that came since detections were judged are some that show something else.
@@ -329,17 +336,12 @@ class Bundle(BundleState):
         used = detections.have(~out & (rows.loose_px == 0))
         noise = detections.mean(self._sigma_of(rows).square()[:, None])[:, 0] / detections.count
         of_each, share = told_apart(innovation, noise, used)
-        # Errors that are larger than they are taken to be are so until the scales have found them.
-        share = share.clamp_max(1.0)
         found = lasting_errors(detections, rows, of_corners, noise, used, of_each)
         # Of sizes it is told once, of a fit that has come to rest: where they count for less, their errors show what else is
         # wrong.
-        is_told = (before.of_many[1] > 0) | (self.judged == 0)
-        far = torch.where(self.share_there == 1, 1.0, 0.5).to(share)
-        now, rests = before.toward(found, far, noise.mean(), is_told)
-        share_rests = (share - self.share_there).abs() <= _SHARE_RESTS
-        share = torch.lerp(self.share_there, share, far)
-        return now, share, torch.stack((rests, share_rests))
+        is_told = (self.lasting[1] > 0) | (self.judged == 0)
+        # Errors that are larger than they are taken to be are so until the scales have found them.
+        return before.toward(found, share.clamp_max(1.0), noise.mean(), is_told)
 
     def problem(self) -> Problem:
         """The least-squares problem with the matches and scales of the moment, lanes held where they are.

@@ -80,6 +80,8 @@ class BundleState(nn.Module):
     """By detection of corners, how far all else foresees it shifted, and by what (`detection_shifts`)."""
     share_there: Tensor
     """Share of the variances of poses' errors, as they are taken for, that is there."""
+    strides: Tensor
+    """How shifts and that share were followed the last time (`Followed.stride`)."""
     told_at: Tensor
     """The scales by which all these were found; NaN before."""
 
@@ -134,6 +136,7 @@ class BundleState(nn.Module):
         self.register_buffer("held_off", values["pose"].new_zeros(0))
         self.register_buffer("innovation", values["pose"].new_zeros(0, 3))
         self.register_buffer("share_there", torch.ones_like(self.scale[0]))
+        self.register_buffer("strides", torch.zeros_like(self.lasting))
         self.register_buffer("told_at", torch.full_like(self.scales(), torch.nan))
         self.frame, self.lane_count = unknowns.frame, unknowns.lane_count
         # Their matrices are the bundle's own: lenses are taken anew in place.

@@ -27,8 +27,12 @@ from crowdmap_torch.optim.tridiagonal import solve_tridiagonal
 _SHIFT_LAGS, _SIZE_LAGS = 30, 90
 """Detections of a track that are this far apart are taken to be shifted, and too large, independently: what lasts longer of
 a shift poses take up."""
+_LONGER = 2**0.5
+"""By this factor strides grow until they are half of the way."""
 _RESTS = 0.2
 """The variance of a detection's shift that would change by less than this share is at rest."""
+_SHARE_RESTS = 0.2
+"""The share of poses' errors that is there is at rest where it changes by less than this: by as much of a small pull."""
 _LEAST = 1e-30
 """Far below any weight or square of pixels."""
 _LEAST_OF_MANY = 1 / (1 + 2 * _SHIFT_LAGS)
@@ -118,26 +122,53 @@ class Lasting:
     of_each: Float[Tensor, " 2"]
     """Variances of single errors; never more than those."""
 
+
+@dataclass(frozen=True)
+class Followed:
+    """What detections have wrong together and what poses have, as far as that has been followed."""
+
+    lasting: Lasting
+    share: Float[Tensor, ""]
+    """Share of the variances of poses' errors that is there; one before the first time."""
+    stride: Float[Tensor, " 2"]
+    """By which shares of their ways shifts and that share went the last time, with the signs of the ways; zero before."""
+
     def toward(
         self,
         found: Lasting,
-        far: Float[Tensor, ""],
+        share: Float[Tensor, ""],
         noise: Float[Tensor, ""],
         sizes_are_told: Bool[Tensor, ""],
-    ) -> tuple[Lasting, Bool[Tensor, ""]]:
-        """On the way to what was `found`, and whether nothing changes: shifts go so `far`, sizes all of it if they go.
+    ) -> tuple[Followed, Bool[Tensor, " 2"]]:
+        """On the way to what was `found`, and whether what lasts and the `share` rest; sizes go all of it if they go.
 
-        Shifts rest where they change by little beside themselves and what `noise` makes of the mean of a detection [px^2].
+        The first time the others do, then half of it; where they turn back half as far as the last time, and from there on
+        ever further again: what they are found by follows them, and may jump. They rest where half of the way, or less if
+        that is as far as they go, is little. `noise` is what corners' own makes of the mean of a detection [px^2].
         """
-        change = (found.of_many - self.of_many).abs()
-        shifts_rest = change[0] <= _RESTS * (found.of_many[0] + noise)
-        rest = torch.stack((shifts_rest, sizes_are_told))
-        goes = torch.where(rest, 0.0, torch.stack((far, torch.ones_like(far))))
-        now = Lasting(
-            torch.lerp(self.of_many, found.of_many, goes),
-            torch.lerp(self.of_each, found.of_each, goes),
+        little = torch.stack(
+            (_RESTS * (found.of_many[0] + noise), torch.full_like(share, _SHARE_RESTS))
         )
-        return now, (rest | (change == 0)).all()
+        way = torch.stack((found.of_many[0] - self.lasting.of_many[0], share - self.share))
+        turns = (way * self.stride < 0) & (way.abs() > little)
+        far = torch.where(self.stride == 0, 0.5, self.stride.abs())
+        far = torch.where(turns, far / 2, far)
+        rest = 2 * far * way.abs() <= little
+        far = torch.where(turns | rest, far, _LONGER * far).clamp_max(0.5)
+        is_first = self.share == 1
+        stride = torch.where(is_first, 0.0, far.copysign(way))
+        far = torch.where(is_first, 1.0, far)
+        before, change = self.lasting, (found.of_many - self.lasting.of_many).abs()
+        goes = torch.stack(
+            (torch.where(rest[0], 0.0, far[0]), torch.where(sizes_are_told, 0.0, 1.0).to(far))
+        )
+        lasting = Lasting(
+            torch.lerp(before.of_many, found.of_many, goes),
+            torch.lerp(before.of_each, found.of_each, goes),
+        )
+        lasting_rests = ((goes == 0) | (change == 0)).all()
+        now = Followed(lasting, torch.lerp(self.share, share, far[1]), stride)
+        return now, torch.stack((lasting_rests, rest[1]))
 
 
 def shared_errors(

@@ -41,8 +41,9 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     """One step of the solver, folded into the bundle, and whether the adjustment is finished.
 
     Lanes are matched anew and the scales narrowed after every step that was taken; detections are judged when the scales
-    that they are judged by first come to rest, or do so with new ones, and when the solver stops. It is finished when that
-    changes nothing, or no more than is lost in how little is known.
+    that they are judged by first come to rest, and when the solver stops. Those that came in since are judged after two
+    steps, by the noise that is known: what is wrong among them would have that grow step by step. It is finished when
+    judging changes nothing, or no more than is lost in how little is known.
     """
     problem, first = bundle.problem(), int(bundle.judged) == 0
     bundle.steps_judged += not first
@@ -58,9 +59,11 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     del problem
     if not bool(state.accepted.all()) and not state.done:
         return state, False
-    evidence = bundle.evidence() or bundle.told_by(normal, corners)
+    waits = bool(bundle.unjudged.any())
+    evidence = None if waits else bundle.evidence() or bundle.told_by(normal, corners)
     del corners
-    of_border = normal.border_information() if bundle.fleet.kinds else None
+    follows = bool(bundle.fleet.kinds) and not waits
+    of_border = normal.border_information() if follows else None
     bundle.fold(dict(state.values))
     found = bundle.refresh(evidence, of_border)
     # Scales that no longer move anything are at rest, however much they still change: little is known of them.
@@ -69,14 +72,16 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     near = bundle.config.lm.move_tolerance * (_NEAR if found.judging else 1.0)
     settled = state.done and bool((moves < near).all())
     at_rest = found.scales or settled
-    soon = first or bool(bundle.unjudged.any())
-    if (found.judging or settled if soon else at_rest and state.done) and bundle.judge(normal):
+    # What came in has a step to go where it is seen, and one that tells where that is.
+    soon = found.judging and not (waits and bool(state.in_sigmas_before.isinf().any()))
+    is_time = soon or settled if first or waits else at_rest and state.done
+    if is_time and bundle.judge(normal):
         if state.done:
             state = lm.settled(bundle.problem(), state, normal, bundle.config.lm)
         at_rest &= state.done
         if at_rest:
             bundle.fold(dict(state.values))
             at_rest = bundle.refresh(evidence).scales or settled
-    if state.done and at_rest:
+    if state.done and at_rest and not waits:
         return state, True
     return lm.changed(state), False

@@ -12,6 +12,7 @@ from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment import bundle as bundle_module
 from crowdmap_torch.adjustment.bundle import _NEW_REACH, Bundle
 from crowdmap_torch.adjustment.footing import Footing, footing_of
+from crowdmap_torch.adjustment.steps import adjust_step
 from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.crowd_lanes.joined_anew import share_twice
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig
@@ -87,14 +88,41 @@ def test_detections_that_are_new_tell_nothing_of_what_lasts_until_they_are_judge
             error[rows.sign == 0] = 20.0
             of_sign = bundle.detections.mean((rows.sign == 0).double()[:, None])[:, 0] == 1
             innovation[of_sign] = innovation.new_tensor([400.0, 1.0, 0.0])
-        lasting, share, _ = bundle._seen_lasting(error, innovation)
-        told.append((float(lasting.of_many[0]), float(share)))
+        seen, _ = bundle._seen_lasting(error, innovation)
+        told.append((float(seen.lasting.of_many[0]), float(seen.share)))
     assert told[0][0] > 1.0 and told[1] == told[2]
     # That is no judgement of the others, but what poses tell is asked anew.
     before = new.scales()
     new.judge(new.backend().assemble(new.problem(), new.values()))
     assert int(new.judged) == 1 and not new.unjudged.any()
     assert not torch.equal(new.scales(), before)
+
+
+def test_noise_waits_until_detections_that_are_new_were_judged_two_steps_later(
+    tiny, tiny_result: MapResult, ended: Bundle
+):
+    """Those of a sign that comes in show something else in every other frame: poses would be made to tremble."""
+    first = anew(tiny, tiny_result.first, ended)
+    bundle = built(tiny, tiny_result, replace(first, footing=without_first(ended)))
+    new = bundle.unjudged.clone()
+    rows = bundle.corners
+    away = torch.where((rows.sign == 0) & (rows.frame % 2 == 0), 30.0, 0.0).to(rows.px)
+    shift = torch.eye(3).to(rows.px).repeat(len(rows), 1, 1)
+    shift[:, 0, 2] = away
+    rows.matrix.copy_(shift @ rows.matrix)
+    names = ("prior_scale", "white_scale", "lasting", "lasting_each", "share_there", "told_at")
+    before = {name: getattr(bundle, name).clone() for name in names}
+    state, backend = adjust.start(bundle), bundle.backend()
+    for step in (1, 2, 3):
+        state, finished = adjust_step(bundle, state, backend)
+        assert not finished
+        assert bool(bundle.unjudged.any()) == (step < 2)
+        if step == 1:
+            for name in names:
+                assert torch.equal(getattr(bundle, name).nan_to_num(), before[name].nan_to_num())
+    # By the noise that was known they have no say.
+    assert bundle.given_up[new].double().mean() > 0.3
+    assert not torch.equal(bundle.told_at.nan_to_num(), before["told_at"].nan_to_num())
 
 
 @pytest.mark.parametrize("reach", [_NEW_REACH, 1.0], ids=["new ones have a say", "they have none"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ from torch import Tensor
 from crowdmap_torch.adjustment.bundle import Bundle, Evidence
 from crowdmap_torch.adjustment.observations import CornerObservations
 from crowdmap_torch.adjustment.shared_corner_errors import (
+    Followed,
     Lasting,
     corner_detections,
     kept_in_tracks,
@@ -306,3 +308,41 @@ def test_loose_corners_of_boxes_do_not_hide_what_lasts(adjusted: Adjusted, share
     # Five pushes of 0.4 px in each shift: 4 px^2 in the mean of many, less where centres follow each other with gaps.
     assert 1.0 < float(tight.lasting[0]) < 7.0
     torch.testing.assert_close(mixed.lasting, tight.lasting)
+
+
+def followed(by: Callable[[float], float], steps: int) -> tuple[list[float], list[bool]]:
+    """Variances of shifts, step by step, that are found by where they are, and whether they rest; noise of none."""
+    zero, told = torch.zeros((), dtype=F64), torch.tensor(True)
+    at = Followed(
+        Lasting(torch.zeros(2, dtype=F64), torch.zeros(2, dtype=F64)), zero + 1, zero.expand(2)
+    )
+    been, rests = [], []
+    for _ in range(steps):
+        here = float(at.lasting.of_many[0])
+        found = torch.tensor([by(here), 0.0], dtype=F64)
+        at, rest = at.toward(Lasting(found, found / 2), zero + 0.9, zero, told)
+        been.append(float(at.lasting.of_many[0]))
+        rests.append(bool(rest[0]))
+        assert float(at.lasting.of_each[0]) <= been[-1]
+    return been, rests
+
+
+def test_what_lasts_goes_all_the_way_once_and_then_half_of_it():
+    been, rests = followed(lambda here: 1.0 if here == 0 else 2.0, 6)
+    assert been == pytest.approx([1.0, 1.5, 1.75, 1.75, 1.75, 1.75])
+    # It stays where it is by a fifth of what was found.
+    assert rests == [False, False, False, True, True, True]
+
+
+@pytest.mark.parametrize("jump", [0.83, 0.86, 0.92])
+def test_what_is_found_to_be_little_where_it_is_much_comes_to_rest(jump: float):
+    """Half of the way each time it would go round for ever: up, up, down."""
+    been, rests = followed(lambda here: 1.05 if here < jump else 0.06, 30)
+    assert been[:3] == pytest.approx([1.05, 0.555, been[2]])
+    assert all(rests[-8:])
+    assert abs(been[-1] - jump) < 0.25
+
+
+def test_where_it_turns_back_for_once_it_goes_on_half_way():
+    been, _ = followed(lambda here: 4.0 if here in (0.0, 1.0) else 1.0 if here == 4.0 else 8.0, 24)
+    assert been[-1] == pytest.approx(8.0, rel=0.2)
