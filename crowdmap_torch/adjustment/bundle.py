@@ -151,15 +151,17 @@ class Bundle(BundleState):
 
     @torch.no_grad()
     def refresh(
-        self, evidence: Evidence | None = None, of_border: BorderInformation | None = None
+        self,
+        evidence: Evidence | None = None,
+        of_border: BorderInformation | None = None,
+        waits: bool = False,
     ) -> AtRest:
         """Matches lanes anew and narrows the scales; returns which of them have come to rest.
 
-        The scales of pixels start at what the residuals show, so that a wrong start does not make outliers of
-        everything, and fall as the fit improves; they never grow again. What detections of a sign have wrong together is
-        told from zero on once that of corners is at rest: before that it is the drift. Those of the poses' prior follow the
-        drift and the noise about it, as far as there is `evidence` of them, those of calibrations what `of_border` tells
-        of cars; while detections are unjudged none of these does.
+        The scales of pixels start at what the residuals show, so that a wrong start makes no outliers of all, and fall
+        as the fit improves; they never grow again. What detections of a sign have wrong together is told from zero on once
+        that of corners is at rest: before that it is the drift. Those of the poses' prior follow the drift and the noise
+        about it by the `evidence`, those of calibrations what `of_border` tells of cars; none while noise `waits`.
         """
         values, made_with = self.values(), self.scales()
         if len(self.lane_points):
@@ -182,7 +184,7 @@ class Bundle(BundleState):
             self.innovation.copy_(evidence.innovation)
         judging, at_rest = self._narrow(values, foreseen)
         self.refreshed.fill_(True)
-        if bool(self.unjudged.any()):
+        if waits:
             return AtRest(at_rest and judging, judging)
         creeps: list[Tensor] = []
         if evidence is not None:
@@ -325,8 +327,7 @@ class Bundle(BundleState):
 
         From the second time on shifts and that share go half of the way to where they are found, or less, by what they were.
         """
-        lasting = Lasting(self.lasting, self.lasting_each)
-        before = Followed(lasting, self.share_there, self.strides)
+        before = Followed(Lasting(self.lasting, self.lasting_each), self.share_there, self.strides)
         if not len(of_corners):
             return before, self.given_up.new_ones(2)
         rows, detections = self.whole.corners, self.whole.detections

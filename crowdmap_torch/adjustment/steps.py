@@ -26,7 +26,7 @@ def start(bundle: Bundle) -> lm.LmState:
     Of many drives the convoys find their own.
     """
     bundle.fold(bundle.values())
-    bundle.refresh()
+    bundle.refresh(waits=bool(bundle.unjudged.any()))
     problem, values = bundle.problem(), bundle.values()
     backend = bundle.backend()
     if isinstance(backend, ChainBackend) and len(bundle.convoys) == 1:
@@ -65,7 +65,7 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     follows = bool(bundle.fleet.kinds) and not waits
     of_border = normal.border_information() if follows else None
     bundle.fold(dict(state.values))
-    found = bundle.refresh(evidence, of_border)
+    found = bundle.refresh(evidence, of_border, waits=waits)
     # Scales that no longer move anything are at rest, however much they still change: little is known of them.
     # One short step does not tell: it may be the last before other detections count.
     moves = torch.maximum(state.in_sigmas_before, state.in_sigmas_left)
@@ -74,7 +74,7 @@ def adjust_step(bundle: Bundle, state: lm.LmState, backend: MapBackend) -> tuple
     at_rest = found.scales or settled
     # What came in has a step to go where it is seen, and one that tells where that is.
     soon = found.judging and not (waits and bool(state.in_sigmas_before.isinf().any()))
-    is_time = soon or settled if first or waits else at_rest and state.done
+    is_time = (soon or settled) if first or waits else (at_rest and state.done)
     if is_time and bundle.judge(normal):
         if state.done:
             state = lm.settled(bundle.problem(), state, normal, bundle.config.lm)

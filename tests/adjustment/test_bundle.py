@@ -103,9 +103,12 @@ def test_scales_that_move_no_landmark_keep_no_adjustment_going(
     build = builder(tiny, tiny_result, 5.0)
     bundle, refresh = build(), Bundle.refresh
 
-    def restless(self: Bundle, *args: Any) -> AtRest:
-        refresh(self, *args)
+    def restless(self: Bundle, *args: Any, **how: Any) -> AtRest:
+        refresh(self, *args, **how)
         return AtRest(False, few)
+
+    def moving(self: Bundle, *args: Any, **how: Any) -> AtRest:
+        return replace(restless(self, *args, **how), judging=False)
 
     monkeypatch.setattr(Bundle, "refresh", restless)
     state = adjust.adjust(bundle)
@@ -113,7 +116,7 @@ def test_scales_that_move_no_landmark_keep_no_adjustment_going(
     assert state.iterations < lm_config.max_iterations and int(bundle.judged) >= 1
     assert float(state.in_sigmas_left) < near * lm_config.move_tolerance
     # By scales that go on moving landmarks nothing is judged.
-    monkeypatch.setattr(Bundle, "refresh", lambda *args: replace(restless(*args), judging=False))
+    monkeypatch.setattr(Bundle, "refresh", moving)
     bundle, moves = build(), replace(lm_config, max_iterations=state.iterations, move_tolerance=0.0)
     bundle.config = replace(bundle.config, lm=moves)
     assert adjust.adjust(bundle).iterations == state.iterations and int(bundle.judged) == 0
