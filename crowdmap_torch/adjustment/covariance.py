@@ -68,7 +68,7 @@ class MapUncertainty:
         return at_least(self.center - self.shared, 0.0)
 
     def of_signs(self, into: Int[Tensor, " n"]) -> MapUncertainty:
-        """That of the signs that are themselves, where `into` has of each sign which one it is."""
+        """The same but for the signs that go `into` another one; what stays is its own."""
         own = into == torch.arange(len(into), device=into.device)
         found = self.influence
         if found is not None and len(into):

@@ -304,7 +304,7 @@ def with_company(
 def merged_signs(
     signs: Signs, associations: Sequence[Association], into: Int[Tensor, " n"]
 ) -> tuple[Signs, tuple[Association, ...]]:
-    """The signs that are themselves of those that each of them is, and which of them each detection shows."""
+    """The signs but for those that go `into` another one, and which of them each detection shows; what stays is its own."""
     goes = into != torch.arange(len(into), device=into.device)
     count = polygon.corner_count(signs.shape)
     turn, _ = polygon.best_shift(signs.corners_world[into], signs.corners_world, count)
