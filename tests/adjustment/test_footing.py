@@ -9,8 +9,9 @@ import torch
 from worlds.split_landmarks import with_a_split_sign, with_split_lanes
 
 from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.adjustment import bundle as bundle_module
-from crowdmap_torch.adjustment.bundle import _NEW_REACH, Bundle
+from crowdmap_torch.adjustment import bundle_terms
+from crowdmap_torch.adjustment.bundle import Bundle
+from crowdmap_torch.adjustment.bundle_terms import _NEW_REACH
 from crowdmap_torch.adjustment.footing import Footing, footing_of
 from crowdmap_torch.adjustment.steps import adjust_step
 from crowdmap_torch.config import MapperConfig
@@ -129,7 +130,7 @@ def test_noise_waits_until_detections_that_are_new_were_judged_two_steps_later(
 def test_a_sign_that_is_new_goes_where_it_is_seen_though_noise_is_known_to_be_small(
     tiny, tiny_result: MapResult, ended: Bundle, monkeypatch: pytest.MonkeyPatch, reach: float
 ):
-    monkeypatch.setattr(bundle_module, "_NEW_REACH", reach)
+    monkeypatch.setattr(bundle_terms, "_NEW_REACH", reach)
     first = anew(tiny, tiny_result.first, ended)
     T = first.signs.T_world_sign.clone()
     T[0, 2, 3] += 0.25
