@@ -8,8 +8,7 @@ import pytest
 import torch
 from worlds.split_landmarks import with_a_split_sign, with_split_lanes
 
-from crowdmap_torch.adjustment import adjust
-from crowdmap_torch.adjustment import bundle_terms
+from crowdmap_torch.adjustment import adjust, bundle_terms
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.bundle_terms import _NEW_REACH
 from crowdmap_torch.adjustment.footing import Footing, footing_of
