@@ -12,22 +12,22 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from crowdmap_torch.adjustment import adjust
 from crowdmap_torch.adjustment.bundle import Bundle
 from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
 from crowdmap_torch.adjustment.detection_lanes import with_lanes
-from crowdmap_torch.adjustment.footing import Footing, footing_of
+from crowdmap_torch.adjustment.first_map import FirstMap
+from crowdmap_torch.adjustment.footing import footing_of
 from crowdmap_torch.adjustment.witnesses import witnesses
 from crowdmap_torch.config import MapperConfig, config_hash
-from crowdmap_torch.crowd_lanes.cluster import LaneRound, cluster_lanes
+from crowdmap_torch.crowd_lanes.cluster import cluster_lanes
 from crowdmap_torch.crowd_lanes.join import join_lanes
 from crowdmap_torch.crowd_lanes.joined_anew import joined_anew
 from crowdmap_torch.crowd_lanes.placed_drives import place_drives
-from crowdmap_torch.crowd_lanes.table import LaneSupport, support_of_pieces
-from crowdmap_torch.crowd_lanes.tie_groups import GroupTies
+from crowdmap_torch.crowd_lanes.table import support_of_pieces
 from crowdmap_torch.crowd_signs.complete_tracks import (
     associate_detections,
     associated_once,
@@ -36,11 +36,11 @@ from crowdmap_torch.crowd_signs.complete_tracks import (
     with_company,
     without_strayed,
 )
-from crowdmap_torch.crowd_signs.completion import AssociatedSigns, CompletedTracks
-from crowdmap_torch.crowd_signs.duplicates import may_be_one, same_sign
+from crowdmap_torch.crowd_signs.completion import AssociatedSigns
+from crowdmap_torch.crowd_signs.duplicates import may_be_one, none_of_the_map, same_sign
 from crowdmap_torch.crowd_signs.gather import gather_signs, signs_of_crowd
 from crowdmap_torch.crowd_signs.journey_bias import without_bias
-from crowdmap_torch.crowd_signs.register import Crowd, register_crowd
+from crowdmap_torch.crowd_signs.register import register_crowd
 from crowdmap_torch.fleet.choice import engine_of
 from crowdmap_torch.fleet.engine import Engine
 from crowdmap_torch.fleet.here import InProcess
@@ -86,37 +86,6 @@ class JourneyMap:
     lane_tracklets: Tracklets
     lanes: Lanes
     lane_report: LaneReport
-
-
-@dataclass(frozen=True)
-class FirstMap:
-    """The map of the cluster heads, and all that bundle adjustment starts from (section V)."""
-
-    signs: Signs
-    lanes: Lanes
-    lane_support: LaneSupport
-    """Which lane each place of the journeys' own lane pieces is of."""
-    tentative: Signs
-    lane_rounds: tuple[LaneRound, ...]
-    """Clusterings of the journeys' lane pieces (`paper2017`; else none)."""
-    crowd: Crowd
-    associations: tuple[Association, ...]
-    drifts: tuple[Float[Tensor, "_ 6"], ...]
-    """Per journey the tangents from the given poses to those without bias."""
-    completed: CompletedTracks | None
-    """What clustering had set aside and was brought back; None with `paper2017`, which does not."""
-    ties: GroupTies | None = None
-    """How drives that no sign ties to others were placed by lanes; None with `paper2017`, which does not."""
-    anew: int = 0
-    """How often it was made anew of an adjusted map."""
-    joined: int = 0
-    """Signs that went into others then, or astray."""
-    found_later: int = 0
-    """Signs that came to the map then."""
-    before: FirstMap | None = None
-    """That of the clusters, before any adjustment, where it was made anew."""
-    footing: Footing | None = None
-    """Where the adjustment of which it was made stood."""
 
 
 @dataclass(frozen=True)
@@ -342,25 +311,25 @@ def made_anew(
 ) -> tuple[FirstMap | None, MapUncertainty | None]:
     """What the adjustment begins again with: where it was, without signs that turned out to be one or none; None: nothing.
 
-    None is what went astray, is another one from afar, or fits too few drives and is none of two that may be one; later on
-    `finish_map` joins those. Markers that are there twice are joined anew, signs of single drives that are one come in while
-    a round can tell whether they fit. With it the covariances, if they had to be known: that can wait until it has `ended`.
+    It does so for those once; later on `finish_map` joins them and lets them go. Markers that are there twice are joined
+    anew, signs of single drives that are one come in while a round can tell whether they fit. With it the covariances, if
+    they had to be known: that can wait until it has `ended`.
     """
     rules = config.duplicate_signs
     if first.completed is None or first.anew >= rules.rounds:
         return None, None
     (signs, lanes), crowd = adjust.read_map(bundle, first.signs, first.lanes), first.crowd
-    poses, sound = adjust.read_poses(bundle, journeys), crowd.journey_weight > 0
+    poses = adjust.read_poses(bundle, journeys)
     drifts = tuple(map(se3.local, (j.T_world_camera for j in journeys), poses))
     markers = lanes, [m.lanes for m in maps], drifts, crowd.trusted_frames(journeys)
     joined, known = joined_anew(*markers, crowd.positioning, config.lane_join), None
     found = AssociatedSigns(signs, first.tentative, first.associations, first.completed)
-    pair = may_be_one(signs, journeys, first.associations, rules)
-    unseen = witnesses(bundle, sound) < min(config.crowd.min_journeys, len(journeys))
     given = journeys, poses, [m.sign_tracklets for m in maps]
-    how = rules, config.complete_tracks, sound
-    once = without_strayed(*given, found, first.signs, first.drifts, drifts, unseen, pair, *how)
-    if once is None and len(pair) and ended and not first.anew:
+    how, once = (rules, config.complete_tracks, crowd.journey_weight > 0), None
+    goes = None if first.anew else _strayed(journeys, poses, signs, first, bundle, config)
+    if goes is not None and bool(goes.any()):
+        once = without_strayed(*given, found, goes, *how[1:])
+    elif goes is not None and ended and len(may_be_one(signs, journeys, first.associations, rules)):
         known = map_uncertainty(bundle, first.signs, first.lanes, engine)
         found = replace(found, heads=replace(signs, covariance=known.of_their_own))
         once = associated_once(*given, found, *how)
@@ -388,6 +357,22 @@ def made_anew(
     ), known
 
 
+def _strayed(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    signs: Signs,
+    first: FirstMap,
+    bundle: Bundle,
+    config: MapperConfig,
+) -> Bool[Tensor, " n"]:
+    """The adjusted `signs` that went astray, are other ones from afar or fit too few drives to be of the map."""
+    fits = witnesses(bundle, first.crowd.journey_weight > 0)
+    unseen = fits < min(config.crowd.min_journeys, len(journeys))
+    begun = first.associations, first.signs, first.drifts, unseen
+    rules = config.duplicate_signs, config.complete_tracks
+    return none_of_the_map(journeys, poses, signs, *begun, *rules)
+
+
 @one_core_each()
 @torch.no_grad()
 def finish_map(
@@ -402,7 +387,8 @@ def finish_map(
 ) -> MapResult:
     """The adjusted map with its covariances, the refined poses, and which landmark each detection shows.
 
-    Signs that are one by now are joined. Covariances that are not known are found by an engine's hosts, of many drives.
+    Where it was begun again already, signs that are one by now are joined, and those that are none go. Covariances that are
+    not known are found by an engine's hosts, of many drives.
     """
     poses = adjust.read_poses(bundle, journeys := dataset.journeys)
     uncertainty = uncertainty or map_uncertainty(bundle, first.signs, first.lanes, engine)
@@ -411,7 +397,8 @@ def finish_map(
     associations = first.associations
     if first.anew:
         own = replace(signs, covariance=uncertainty.of_their_own)
-        into = same_sign(own, journeys, associations, config.duplicate_signs)
+        goes = _strayed(journeys, poses, signs, first, bundle, config)
+        into = same_sign(own, journeys, associations, config.duplicate_signs, goes)
         signs, associations = merged_signs(signs, associations, into)
         uncertainty = uncertainty.of_signs(into)
     if first.completed is not None:

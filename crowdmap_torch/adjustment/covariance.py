@@ -68,12 +68,13 @@ class MapUncertainty:
         return at_least(self.center - self.shared, 0.0)
 
     def of_signs(self, into: Int[Tensor, " n"]) -> MapUncertainty:
-        """The same but for the signs that go `into` another one; what stays is its own."""
+        """The same but for the signs that go `into` another one, or none, -1; what stays is its own."""
         own = into == torch.arange(len(into), device=into.device)
         found = self.influence
         if found is not None and len(into):
             far, number = found.farthest_sign, own.cumsum(0) - 1
-            renumbered = torch.where(far < 0, far, number[into[far.clamp_min(0)]])
+            far = torch.where(far < 0, far, into[far.clamp_min(0)])
+            renumbered = torch.where(far < 0, far, number[far.clamp_min(0)])
             found = replace(found, farthest_sign=renumbered)
         return replace(self, center=self.center[own], corner=self.corner[own], influence=found)
 

@@ -22,12 +22,7 @@ from crowdmap_torch.crowd_signs.completion import (
     CompletedTracks,
     CompleteTracksConfig,
 )
-from crowdmap_torch.crowd_signs.duplicates import (
-    DuplicateSignConfig,
-    duplicate_signs,
-    gone_astray,
-    same_sign,
-)
+from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig, duplicate_signs, same_sign
 from crowdmap_torch.crowd_signs.evidence import (
     of_its_shape,
     seen_by,
@@ -232,29 +227,14 @@ def without_strayed(
     journeys: Sequence[Journey],
     poses: Sequence[Float[Tensor, "_ 4 4"]],
     tracklets: Sequence[Tracklets],
-    after: AssociatedSigns,
-    before: Signs,
-    begun: Sequence[Float[Tensor, "_ 6"]],
-    ended: Sequence[Float[Tensor, "_ 6"]],
-    unseen: Bool[Tensor, " n"],
-    pair: Int[Tensor, "p 2"],
-    config: DuplicateSignConfig,
+    found: AssociatedSigns,
+    goes: Bool[Tensor, " n"],
     completion: CompleteTracksConfig,
     trusted: Bool[Tensor, " j"],
-) -> AssociatedSigns | None:
-    """What is `after` an adjustment without the heads that it shows to be none, and with what else shows the others.
-
-    They have `gone_astray`, are `unseen` or, by the adjusted poses, `duplicate_signs`, as far apart as rays from afar leave
-    open; of a `pair` that may be one both stay. None if all do.
-    """
-    astray = gone_astray(before, after.heads, journeys, after.associations, begun, ended, config)
-    far = replace(completion, duplicate_m=config.hidden_m)
-    hidden = duplicate_signs(journeys, poses, after.heads, after.associations, far)
-    goes = astray | (unseen | hidden).index_fill(0, pair.flatten(), False)
-    if not bool(goes.any()):
-        return None
-    left = after.heads[~goes], without_signs(after.associations, goes)
-    return _associated_anew(journeys, poses, tracklets, *left, after.tentative, completion, trusted)
+) -> AssociatedSigns:
+    """What is `found` without the heads that `goes`, and with what else shows the others by adjusted `poses`."""
+    left = found.heads[~goes], without_signs(found.associations, goes)
+    return _associated_anew(journeys, poses, tracklets, *left, found.tentative, completion, trusted)
 
 
 def with_company(
@@ -304,12 +284,16 @@ def with_company(
 def merged_signs(
     signs: Signs, associations: Sequence[Association], into: Int[Tensor, " n"]
 ) -> tuple[Signs, tuple[Association, ...]]:
-    """The signs but for those that go `into` another one, and which of them each detection shows; what stays is its own."""
-    goes = into != torch.arange(len(into), device=into.device)
-    count = polygon.corner_count(signs.shape)
+    """The signs but for those that go `into` another one, and which of them each detection shows; what stays is its own.
+
+    What goes into none, -1, leaves its detections without a sign.
+    """
+    every = torch.arange(len(into), device=into.device)
+    goes, count = into != every, polygon.corner_count(signs.shape)
     turn, _ = polygon.best_shift(signs.corners_world[into], signs.corners_world, count)
     moved = tuple(_shown_by(a, into, turn, count) for a in associations)
-    sure = signs.confidence.scatter_reduce(0, into, signs.confidence, "amax")
+    heir = torch.where(into < 0, every, into)
+    sure = signs.confidence.scatter_reduce(0, heir, signs.confidence, "amax")
     return replace(signs, confidence=sure)[~goes], without_signs(moved, goes)
 
 

@@ -7,7 +7,7 @@ adjustment, which sees all rays at once, brings them to one place.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -38,8 +38,9 @@ class DuplicateSignConfig(Settings):
     """When two signs of an adjusted map are one; costs are squared standard deviations."""
 
     rounds: RoundsOrNone = 2
-    """So many times at most the adjustment begins again with what was joined or found; 0: never. Signs that are one when it
-    has begun again already are joined as they stand, the one that was seen most often stays."""
+    """So many times at most the adjustment begins again with what was joined or found; 0: never. When it has begun again
+    already, signs that are one are joined as they stand, the one that was seen most often stays, and those that are none
+    go."""
     merge_cost: Cost = 9.0
     """Signs of one shape whose codes do not contradict each other are one if they are closer than this, ..."""
     max_distance_m: Length = 1.5
@@ -109,27 +110,49 @@ def duplicate_signs(
     return duplicate
 
 
+def none_of_the_map(
+    journeys: Sequence[Journey],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
+    signs: Signs,
+    associations: Sequence[Association],
+    before: Signs,
+    begun: Sequence[Float[Tensor, "_ 6"]],
+    unseen: Bool[Tensor, " n"],
+    config: DuplicateSignConfig,
+    completion: CompleteTracksConfig,
+) -> Bool[Tensor, " n"]:
+    """True for adjusted `signs` that turned out to be none: gone astray from `before`, `unseen`, or another one from afar.
+
+    `begun` are the tangents from the given poses to those before the adjustment, which ended at `poses`. Of two that
+    `may_be_one` none goes but what went astray.
+    """
+    moved = before, signs, journeys, associations, begun, poses
+    far = replace(completion, duplicate_m=config.hidden_m)
+    goes = unseen | duplicate_signs(journeys, poses, signs, associations, far)
+    pair = may_be_one(signs, journeys, associations, config)
+    return gone_astray(*moved, config) | goes.index_fill(0, pair.flatten(), False)
+
+
 def gone_astray(
     before: Signs,
     after: Signs,
     journeys: Sequence[Journey],
     associations: Sequence[Association],
     begun: Sequence[Float[Tensor, "_ 6"]],
-    ended: Sequence[Float[Tensor, "_ 6"]],
+    poses: Sequence[Float[Tensor, "_ 4 4"]],
     config: DuplicateSignConfig,
 ) -> Bool[Tensor, " n"]:
     """True for signs that an adjustment took elsewhere, by their rows `before` and `after` it.
 
     What drives took for one sign though its rays meet nowhere, such as plates of vehicles ahead, goes where it does no
-    harm: far off and up in the air. `begun` and `ended` are the tangents from the given poses to those before and after.
+    harm: far off and up in the air. `begun` are the tangents from the given poses to those before, `poses` those after.
     """
     n, moved = len(before), after.center_world - before.center_world
     least = torch.full_like(moved[:, 0], torch.inf)
-    for journey, association, old, new in zip(journeys, associations, begun, ended, strict=True):
+    for journey, association, old, new in zip(journeys, associations, begun, poses, strict=True):
         rows = torch.nonzero(association.sign >= 0)[:, 0]
         shown, frame = association.sign[rows], journey.signs.frame[rows]
-        given = journey.T_world_camera[frame]
-        move = se3.retract(given, new[frame]) - se3.retract(given, old[frame])
+        move = new[frame] - se3.retract(journey.T_world_camera[frame], old[frame])
         number = group_count(shown, n)
         of_cameras = group_sum(move[:, :3, 3], shown, n) / number.clamp_min(1)[:, None]
         beside = (moved - of_cameras).norm(dim=1)
@@ -162,15 +185,18 @@ def same_sign(
     journeys: Sequence[Journey],
     associations: Sequence[Association],
     config: DuplicateSignConfig,
+    goes: Bool[Tensor, " n"] | None = None,
 ) -> Int[Tensor, " n"]:
     """Which of the adjusted signs each of them is: of those that are one the one with the most detections.
 
-    Covariances are those of centres without what all positions share.
+    Covariances are those of centres without what all positions share. What `goes` is none, -1.
     """
     label = torch.arange(len(signs), device=signs.shape.device)
+    goes = torch.zeros_like(label, dtype=torch.bool) if goes is None else goes
     pair = _alike(signs, associations, config)
+    pair = pair[~goes[pair].any(1)]
     if not len(pair):
-        return label
+        return label.masked_fill(goes, -1)
     sigma = signs.size.new_full((3,), config.least_sigma_m)
     cost = sign_distance(signs, signs, pair, config.similarity, sigma)
     overlaps = _overlap(signs, pair, config) & cost.isfinite()
@@ -188,7 +214,7 @@ def same_sign(
         label = mutual_partners(group, cost[one], len(signs))[label]
     number = sum((group_count(a.sign, len(signs)) for a in associations), torch.zeros_like(label))
     _, own = torch.unique(label, return_inverse=True)
-    return group_argmin(-number.to(cost), own)[own]
+    return group_argmin(-number.to(cost), own)[own].masked_fill(goes, -1)
 
 
 def _alike(

@@ -17,7 +17,14 @@ from crowdmap_torch.config import MapperConfig
 from crowdmap_torch.crowd_lanes.joined_anew import share_twice
 from crowdmap_torch.crowd_signs.duplicates import DuplicateSignConfig
 from crowdmap_torch.geometry import se3
-from crowdmap_torch.mapper import FirstMap, MapResult, adjusted_map, build_bundle, made_anew
+from crowdmap_torch.mapper import (
+    FirstMap,
+    MapResult,
+    adjusted_map,
+    build_bundle,
+    finish_map,
+    made_anew,
+)
 from crowdmap_torch.noise.positioning import PositioningNoise
 from crowdmap_torch.report.summaries import counts_of
 from crowdmap_torch.tables import Dataset
@@ -280,3 +287,25 @@ def test_a_sign_that_the_adjustment_took_elsewhere_is_none(
     found = adjusted_map(tiny, tiny_result.journey_maps, again, config)
     gone = first.signs[:1].center_world
     assert float(torch.cdist(gone, found.hd_map.signs.center_world).min()) > 0.3
+
+
+def test_a_sign_that_went_elsewhere_after_another_beginning_goes_without_a_third(
+    tiny, tiny_result: MapResult, ended: Bundle
+):
+    first = tiny_result.first
+    elsewhere = first.signs.T_world_sign.clone()
+    elsewhere[0, 1, 3] += 20.0
+    signs = replace(first.signs, T_world_sign=elsewhere)
+    astray, config = replace(first, signs=signs, anew=1), MapperConfig()
+    assert made_anew(tiny.journeys, tiny_result.journey_maps, astray, ended, config)[0] is None
+    state = adjust.start(ended)
+    found = finish_map(tiny, tiny_result.journey_maps, astray, ended, state, config)
+    assert found.first.anew == 1 and counts_of(tiny, found, config)[GONE] == 1
+    # The others stay as they are, as sure as they were.
+    signs, right = found.hd_map.signs, tiny_result.hd_map.signs
+    left = torch.arange(len(right)) != 0
+    assert torch.allclose(signs.center_world, right.center_world[left], atol=1e-3)
+    assert torch.equal(signs.n_observations, right.n_observations[left])
+    of_map = len(first.signs) - 1
+    assert torch.equal(found.uncertainty.center, signs.covariance[:of_map])
+    assert len(found.uncertainty.corner) == of_map

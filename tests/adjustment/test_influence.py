@@ -119,19 +119,21 @@ def test_of_signs_that_went_into_others_the_farthest_is_the_one_that_stays(stree
     known = replace(known, influence=influence(bundle, known.center))
     last = len(known.center) - 1
     into = torch.arange(last + 1)
-    into[[0, last]] = torch.tensor([1, 1])
+    into[[0, last, 2]] = torch.tensor([1, 1, -1])
     assert known.influence is not None
     far = known.influence.farthest_sign.clone()
-    far[:3] = torch.tensor([0, last, -1])
+    far[:] = torch.tensor([0, last, -1])
     known = replace(known, influence=replace(known.influence, farthest_sign=far))
     left = known.of_signs(into)
-    assert torch.equal(left.center, known.center[1:last])
-    assert torch.equal(left.corner, known.corner[1:last])
+    assert torch.equal(left.center, known.center[[1, *range(3, last)]])
+    assert torch.equal(left.corner, known.corner[[1, *range(3, last)]])
     assert left.influence is not None
-    assert left.influence.farthest_sign[:3].tolist() == [0, 0, -1]
-    rest = far[3:]
-    stays = torch.where((rest == 0) | (rest == last), 0, rest - 1)
-    assert torch.equal(left.influence.farthest_sign[3:], stays)
+    assert left.influence.farthest_sign.tolist() == [0, 0, -1]
+    far[:] = torch.tensor([2, 3, 1])
+    assert known.influence is not None
+    left = replace(known, influence=replace(known.influence, farthest_sign=far)).of_signs(into)
+    assert left.influence is not None
+    assert left.influence.farthest_sign.tolist() == [-1, 1, 0]
 
 
 def test_who_has_no_say_has_no_influence(street, every):

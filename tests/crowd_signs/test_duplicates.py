@@ -31,6 +31,7 @@ from crowdmap_torch.crowd_signs.completion import (
 from crowdmap_torch.crowd_signs.duplicates import (
     DuplicateSignConfig,
     may_be_one,
+    none_of_the_map,
     same_sign,
     seen_in_turn,
     seen_together,
@@ -252,7 +253,7 @@ def test_signs_go_astray_beside_the_cameras_that_saw_them(
 ) -> None:
     known = torch.ones(len(drive.sign), dtype=torch.bool)
     before, association = map_of(drive), associated(drive, known)
-    moved = before.T_world_sign.clone()
+    moved, given = before.T_world_sign.clone(), drive.journey.T_world_camera
     # All cameras rise, of the signs the second does not rise with them.
     moved[:, 2, 3] += of_cameras_m
     moved[1, 2, 3] += of_sign_m - of_cameras_m
@@ -262,28 +263,51 @@ def test_signs_go_astray_beside_the_cameras_that_saw_them(
         (association,),
         CompletedTracks((association,), 0, 0),
     )
-    given = drive.journey.T_world_camera
-    begun, risen = torch.zeros(len(given), 6, dtype=F64), given.clone()
-    risen[:, 2, 3] += of_cameras_m
-    drifts = [begun], [se3.local(given, risen)]
+    begun, risen = torch.zeros(len(drive.journey.T_world_camera), 6, dtype=F64), [given.clone()]
+    risen[0][:, 2, 3] += of_cameras_m
     seen = torch.zeros(len(PLACES), dtype=torch.bool)
-    unseen = torch.tensor([False, True, False])
-    made = [tracklets_of(drive.sign)]
-    given, none = ([drive.journey], [risen], made, after, before, *drifts), torch.zeros(0, 2).long()
-    how = CONFIG, COMPLETION, torch.tensor([True])
-    found = without_strayed(*given, seen, none, *how)
+    of_map = [drive.journey], risen, after.heads, [association], before, [begun]
+    goes = none_of_the_map(*of_map, seen, CONFIG, COMPLETION)
     if not astray:
-        assert found is None
-        # What too few saw is none wherever it stands, but of two that may be one.
-        pair = torch.tensor([[0, 1]])
-        assert without_strayed(*given, unseen, pair, *how) is None
-        found = without_strayed(*given, unseen, none, *how)
-    assert found is not None and len(found.heads) == len(PLACES) - 1
+        assert not bool(goes.any())
+        # What too few saw is none wherever it stands.
+        unseen = torch.tensor([False, True, False])
+        goes = none_of_the_map(*of_map, unseen, CONFIG, COMPLETION)
+    assert goes.tolist() == [False, True, False]
+    given = [drive.journey], risen, [tracklets_of(drive.sign)]
+    found = without_strayed(*given, after, goes, COMPLETION, torch.tensor([True]))
     assert torch.equal(found.heads.T_world_sign, moved[[0, 2]])
     number = torch.tensor([0, -1, 1])
     assert torch.equal(found.associations[0].sign, number[association.sign])
     assert found.completed is not None
     assert torch.equal(found.completed.associations[0].sign, number[association.sign])
+
+
+def test_of_two_that_may_be_one_none_goes_that_is_still_there(drive: SignDrive) -> None:
+    signs = with_copy(map_of(drive), 1, (0.05, 0.0, 0.02))
+    first = associated(drive, torch.ones(len(drive.sign), dtype=torch.bool))
+    other = replace(first, sign=torch.where(first.sign == 1, len(PLACES), first.sign))
+    journeys, begun = [drive.journey] * 2, [torch.zeros(len(drive.journey.t_ns), 6, dtype=F64)] * 2
+    of_map = journeys, [j.T_world_camera for j in journeys], signs, [first, other], signs, begun
+    unseen = torch.tensor([True, False, False, True])
+    goes = none_of_the_map(*of_map, unseen, CONFIG, COMPLETION)
+    assert goes.tolist() == [True, False, False, False]
+
+
+def test_what_goes_is_no_sign_and_takes_none_with_it(drive: SignDrive) -> None:
+    n = len(PLACES)
+    signs = with_copy(map_of(drive), 2, (0.1, 0.0, 0.05))
+    first = associated(drive, torch.ones(len(drive.sign), dtype=torch.bool))
+    other = replace(first, sign=torch.where(first.sign == 2, n, first.sign))
+    shown = [first, other]
+    assert same_sign(signs, [drive.journey] * 2, shown, CONFIG).tolist() == [0, 1, 2, 2]
+    goes = torch.arange(n + 1) == n
+    into = same_sign(signs, [drive.journey] * 2, shown, CONFIG, goes)
+    assert into.tolist() == [0, 1, 2, -1]
+    left, (here, there) = merged_signs(signs, shown, into)
+    assert torch.equal(left.T_world_sign, signs.T_world_sign[:n])
+    assert torch.equal(here.sign, first.sign)
+    assert torch.equal(there.sign, torch.where(other.sign == n, -1, other.sign))
 
 
 @pytest.mark.parametrize("fault", ["", "to the side", "too far", "beside it"])
@@ -313,14 +337,13 @@ def test_a_sign_seen_from_afar_alone_is_the_one_behind_it(fault: str):
     nothing = [torch.zeros(len(j.T_world_camera), 6, dtype=F64) for j in journeys]
     unseen = torch.zeros(2, dtype=torch.bool)
     poses, made = [j.T_world_camera for j in journeys], [tracklets_of(s) for s in shown]
-    given = journeys, poses, made, after, heads, nothing, nothing, unseen
-    how = CONFIG, COMPLETION, torch.ones(3, dtype=torch.bool)
-    found = without_strayed(*given, torch.zeros(0, 2).long(), *how)
+    of_map = journeys, poses, heads, associations, heads, nothing, unseen
+    goes = none_of_the_map(*of_map, CONFIG, COMPLETION)
+    assert goes.tolist() == [False, not fault]
     if fault:
-        assert found is None
         return
-    assert found is not None and len(found.heads) == 1
+    trusted = torch.ones(3, dtype=torch.bool)
+    found = without_strayed(journeys, poses, made, after, goes, COMPLETION, trusted)
     assert torch.equal(found.heads.T_world_sign, heads.T_world_sign[:1])
     # What showed it shows the other now.
     assert bool((found.associations[2].sign == 0).all()) and int(found.heads.n_journeys) == 3
-    assert without_strayed(*given, torch.tensor([[0, 1]]), *how) is None
