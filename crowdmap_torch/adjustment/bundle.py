@@ -83,6 +83,7 @@ class Bundle(BundleTerms):
     ) -> None:
         """All drives, or such as are `shared_out`; their leader has the `whole` beside it, with everybody's observations."""
         super().__init__(unknowns, observations, priors, config, shared_out)
+        self.plan = self.elimination() if shared_out is None else shared_out.plan
         # Not a module of this one.
         object.__setattr__(self, "_others", whole)
 
@@ -186,7 +187,7 @@ class Bundle(BundleTerms):
     def _rescale_noise(self, values: Values, evidence: PoseEvidence) -> Float[Tensor, "j 6"]:
         """Finds the noise of poses from frame to frame; the logarithms of what it changes by, where it rests below one."""
         scales = self.prior_scale, self.white_scale
-        term = self._white_term()
+        term = self.pose_terms(self.prior_scale)["pose_white"]
         residual = whitened_residuals(term, values) if len(term) else self.poses_left
         found = self._of_journeys(white_scales(self.prior, residual, evidence.left, *scales))
         return self._move("white_scale", found, _WHITE_RESTS) / _WHITE_RESTS

@@ -165,6 +165,7 @@ class BundleState(nn.Module):
     def pose_terms(self, prior_scale: Float[Tensor, "j _"]) -> dict[str, CostTerm]:
         """What is known of poses beside images: how far positioning may be off, and where cars point."""
         terms = self.prior.terms(prior_scale, self.white_scale)
+        terms["pose_white"] = self.fleet.of_poses(terms["pose_white"], self._by_mount)
         if self.course is not None:
             terms |= self.course.terms(self.prior.white_sigma, self.white_scale)
         return terms

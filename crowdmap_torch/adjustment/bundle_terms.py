@@ -10,12 +10,10 @@ from torch import Tensor
 
 from crowdmap_torch.adjustment import calibration_priors
 from crowdmap_torch.adjustment.bundle_state import BundleState
-from crowdmap_torch.adjustment.config import AdjustConfig
 from crowdmap_torch.adjustment.landmark_terms import about_usual_size, size_class_term, slide_term
 from crowdmap_torch.adjustment.lane_terms import lane_point_terms
 from crowdmap_torch.adjustment.noise_pull import noise_pull_term
 from crowdmap_torch.adjustment.observations import CornerObservations
-from crowdmap_torch.adjustment.parts import Observations, Priors, SharedOut, Unknowns
 from crowdmap_torch.adjustment.shared_corner_errors import Lasting, shared_errors
 from crowdmap_torch.geometry import spline_basis
 from crowdmap_torch.optim.problem import CostTerm, Problem
@@ -39,21 +37,10 @@ class BundleTerms(BundleState):
     """The problem that unknowns and observations make, by the scales of the moment."""
 
     plan: EliminationPlan
-
-    def __init__(
-        self,
-        unknowns: Unknowns,
-        observations: Observations,
-        priors: Priors,
-        config: AdjustConfig,
-        shared_out: SharedOut | None = None,
-    ) -> None:
-        """All drives, or such as are `shared_out`."""
-        super().__init__(unknowns, observations, priors, config, shared_out)
-        self.plan = self._elimination() if shared_out is None else shared_out.plan
+    """The order that unknowns are eliminated in."""
 
     @torch.no_grad()
-    def _elimination(self) -> EliminationPlan:
+    def elimination(self) -> EliminationPlan:
         """Frames hang on the drift's chains, both are eliminated; what drives have to themselves or share goes last.
 
         Landmarks are ranked as they start. Lane points slide to the next control point and no further: the order that is
@@ -122,15 +109,9 @@ class BundleTerms(BundleState):
             if "sign_habit" in terms:
                 habit = about_usual_size(terms["sign_habit"], size, self.config.habit)
                 terms["sign_habit"] = habit
-        terms["pose_white"] = self.fleet.of_poses(terms["pose_white"], self._by_mount)
         terms.update(self._corner_term(self.corner_sigma()))
         terms.update(self._lane_terms(float(self.scale[1] * self.scale[2])))
         return terms
-
-    def _white_term(self) -> CostTerm:
-        """Of poses' errors from frame to frame."""
-        term = self.prior.terms(self.prior_scale, self.white_scale)["pose_white"]
-        return self.fleet.of_poses(term, self._by_mount)
 
     def corner_sigma(self) -> Float[Tensor, " m"]:
         """Standard deviation of every sign corner in u and in v [px]."""
