@@ -21,10 +21,10 @@ from crowdmap_torch.adjustment.covariance import MapUncertainty, map_uncertainty
 from crowdmap_torch.adjustment.detection_lanes import with_lanes
 from crowdmap_torch.adjustment.first_map import FirstMap
 from crowdmap_torch.adjustment.footing import footing_of
+from crowdmap_torch.adjustment.signs_alone import joined_by_signs
 from crowdmap_torch.adjustment.witnesses import witnesses
 from crowdmap_torch.config import MapperConfig, config_hash
 from crowdmap_torch.crowd_lanes.cluster import cluster_lanes
-from crowdmap_torch.crowd_lanes.join import join_lanes
 from crowdmap_torch.crowd_lanes.joined_anew import joined_anew
 from crowdmap_torch.crowd_lanes.placed_drives import place_drives
 from crowdmap_torch.crowd_lanes.table import support_of_pieces
@@ -203,7 +203,10 @@ def map_journey(
 def first_map(
     journeys: Sequence[Journey], maps: Sequence[JourneyMap], config: MapperConfig
 ) -> FirstMap:
-    """Section V-A: landmarks of many journeys in clusters, the journeys' biases, and the cluster heads."""
+    """Section V-A: landmarks of many journeys in clusters, the journeys' biases, and the cluster heads.
+
+    Lane pieces are joined where biases, or signs alone, place the journeys (`joined_by_signs`).
+    """
     config = config.resolved()
     tracklets, sure = [m.sign_tracklets for m in maps], [m.signs for m in maps]
     doubtful, sigma = [m.sign_report.doubtful for m in maps], config.positioning.bias_sigma_m
@@ -221,16 +224,20 @@ def first_map(
             placed = place_drives(journeys, made, crowd, *how, doubt=False)
         poses, drifts, ties = placed.poses, placed.drifts, placed.ties
         crowd = crowd.moved(ties.move)
-        joined = join_lanes(placed.pieces, crowd.positioning, config.lane_join)
-        lanes, support, rounds = joined.lanes, joined.support, ()
     else:
         poses, drifts = without_bias([j.T_world_camera for j in journeys], crowd.bias)
+    rules = config.crowd, config.complete_tracks
+    found = associate_detections(journeys, poses, tracklets, crowd, *rules)
+    if ties is not None:
+        told = journeys, [m.road for m in maps], made, crowd, found, drifts, ties.group
+        rules = config.lane_join, config.adjust, config.calibration
+        drifts, joined = joined_by_signs(*told, *rules)
+        lanes, support, rounds = joined.lanes, joined.support, ()
+    else:
         pieces = concatenate_lanes(made)
         clusters = cluster_lanes(pieces, config.lane_cluster, generator=generator)
         lanes, rounds = clusters.heads, clusters.rounds
         support = support_of_pieces(pieces, clusters.label, config.lane_join.sample_spacing_m)
-    rules = config.crowd, config.complete_tracks
-    found = associate_detections(journeys, poses, tracklets, crowd, *rules)
     return FirstMap(
         signs=found.heads,
         lanes=lanes,

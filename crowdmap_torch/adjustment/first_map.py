@@ -30,7 +30,7 @@ class FirstMap:
     crowd: Crowd
     associations: tuple[Association, ...]
     drifts: tuple[Float[Tensor, "_ 6"], ...]
-    """Per journey the tangents from the given poses to those without bias."""
+    """Per journey the tangents from the given poses to those that lane pieces were joined by."""
     completed: CompletedTracks | None
     """What clustering had set aside and was brought back; None with `paper2017`, which does not."""
     ties: GroupTies | None = None

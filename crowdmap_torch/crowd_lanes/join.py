@@ -83,6 +83,9 @@ class LaneJoinConfig(Settings):
     """... this share of its journeys saw both at once."""
     least_often: Share = 0.25
     """Markers are detected at least this often, as a share of what is usual where the same drives see markers."""
+    doubt_m: Length = 0.25
+    """Where pieces lie further beside their markers than this [m, RMS], these may be others': they are joined where signs
+    alone place the drives, unless markers fall apart there."""
     anew_from: Share = 0.02
     """Where so much of an adjusted map's lanes is there twice, pieces are joined anew by adjusted poses, unless half of that
     would stay, and the adjustment begins again (`duplicate_signs: {rounds: ...}` times at most)."""
@@ -121,6 +124,14 @@ class LaneJoinReport:
     """Lateral scatter of the samples about the lanes as they came."""
     rms_after_m: float
     """The same without the journeys' offsets."""
+    length_m: float
+    """Length of the lanes [m]."""
+
+    @property
+    def samples_per_m(self) -> float:
+        """Samples of pieces on a metre of the lanes; few where pieces of one marker are on several."""
+        used = self.samples - self.stray_samples - self.unused_samples
+        return used / self.length_m if self.length_m else 0.0
 
 
 @dataclass(frozen=True)
@@ -183,6 +194,7 @@ def join_lanes(lanes: Lanes, positioning: PositioningNoise, config: LaneJoinConf
             seldom_m=seldom,
             rms_before_m=_rms(matched.shifted(offset).lateral[used]),
             rms_after_m=_rms(matched.lateral[used]),
+            length_m=float(curves.length.sum()),
         ),
     )
 
@@ -402,7 +414,7 @@ def _nothing(lanes: Lanes, samples: LaneSamples) -> JoinedLanes:
         lanes=lanes.select(row),
         piece_lane=torch.full_like(lanes.journey, -1),
         support=LaneSupport(samples.line.point[:0], row, row, row),
-        report=LaneJoinReport(0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0),
+        report=LaneJoinReport(0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0),
     )
 
 

@@ -28,8 +28,6 @@ class PlacedDrives:
     poses: list[Float[Tensor, "_ 4 4"]]
     drifts: tuple[Float[Tensor, "_ 6"], ...]
     """Per journey the tangents from the given poses to those without bias."""
-    pieces: Lanes
-    """The journeys' lane pieces, of frames that are trusted."""
     better: FirstBiases | None
     """Biases to tell signs apart by once more, as drives were matched with signs that only look like theirs; None: lanes
     do not say so."""
@@ -64,8 +62,7 @@ def place_drives(
     if bool(ties.move.any()):
         bias = crowd.moved(ties.move).bias
         poses, drifts = without_bias(given, bias)
-        pieces = unbiased_pieces(made, drifts, trusted)
         if bool((loosely & ties.is_shifted[group]).any()):
             larger = torch.tensor(crowd.positioning.bias_sigma_m).to(bias_sigma)
             better = bias, larger / larger.new_tensor(positioning.bias_sigma_m)
-    return PlacedDrives(ties, poses, drifts, pieces, better)
+    return PlacedDrives(ties, poses, drifts, better)
