@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -17,7 +17,9 @@ from worlds.pretend_device import DEVICE, PretendTensor, Transfers, pretend_devi
 
 from crowdmap_torch import mapper
 from crowdmap_torch.adjustment import adjust
+from crowdmap_torch.adjustment.signs_alone import moved_by_signs
 from crowdmap_torch.commands.whereabouts import Whereabouts
+from crowdmap_torch.crowd_signs.completion import AssociatedSigns
 from crowdmap_torch.evaluation.evaluate import against, evaluate_map, progress_scalars
 from crowdmap_torch.io.datasets import load_dataset
 from crowdmap_torch.io.maps import read_map
@@ -37,7 +39,10 @@ pytestmark = pytest.mark.filterwarnings("error:.*deterministic")
 
 @pytest.fixture(scope="module")
 def transfers(
-    first_here: Stages, frames_here: FrameByFrame, run_here: tuple[Path, str]
+    first_here: Stages,
+    placed_here: tuple[Tensor, ...],
+    frames_here: FrameByFrame,
+    run_here: tuple[Path, str],
 ) -> Iterator[Transfers]:
     """The device is there for all tests of this file, but not for what is made before it: every operation costs more."""
     before = torch.are_deterministic_algorithms_enabled()
@@ -97,6 +102,22 @@ def frames_here(here: Dataset) -> FrameByFrame:
 def run_here(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A run of the main job on the CPU, and what it said."""
     return optimized(folder, tmp_path_factory.mktemp("here") / "run", "cpu")
+
+
+def placed_by_signs(
+    dataset: Dataset, maps: Sequence[mapper.JourneyMap], heads: mapper.FirstMap
+) -> tuple[Tensor, ...]:
+    """Where an adjustment of signs alone takes drives."""
+    config, shown = short(), (heads.signs, heads.tentative, heads.associations, heads.completed)
+    given = dataset.journeys, [m.road for m in maps], [m.lanes for m in maps], heads.crowd
+    assert heads.ties is not None
+    found = AssociatedSigns(*shown), heads.drifts, heads.ties.group
+    return moved_by_signs(*given, *found, config.adjust, config.calibration)
+
+
+@pytest.fixture(scope="module")
+def placed_here(here: Dataset, first_here: Stages) -> tuple[Tensor, ...]:
+    return placed_by_signs(here, *first_here)
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +196,13 @@ def test_maps_on_a_device_are_judged_beside_a_survey_on_the_cpu(
     scalars = progress_scalars(heads.signs, against(survey), lanes=heads.lanes)
     signs, lanes = to_device((heads.signs, heads.lanes), "cpu")
     assert scalars == progress_scalars(signs, against(survey), lanes=lanes)
+
+
+def test_signs_alone_place_drives_as_they_do_on_the_cpu(placed_here, there: Dataset, first):
+    found = placed_by_signs(there, *first)
+    for one, other in zip(found, placed_here, strict=True):
+        assert isinstance(one, PretendTensor)
+        assert torch.equal(one.cpu(), other)
 
 
 class AtOnce:
