@@ -8,6 +8,7 @@ they were joined. A few of its steps with signs alone take them to their own.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 
@@ -90,8 +91,9 @@ def moved_by_signs(
     is_placed[bundle.prior.nodes.journey] = True
     if not bool(is_placed.any()):
         return tuple(drifts)
-    for _ in islice(steps(bundle, start(bundle)), _STEPS):
-        pass
+    with closing(steps(bundle, start(bundle))) as taken:
+        for _ in islice(taken, _STEPS):
+            pass
     given = [journey.T_world_camera for journey in journeys]
     ended = [*map(se3.local, given, read_poses(bundle, driven))]
     way = torch.stack([(new - old)[:, :3].mean(0) for new, old in zip(ended, drifts, strict=True)])
